@@ -163,10 +163,10 @@ class _Candidates:
         return np.asarray(np.minimum(of_u, of_v))
 
     def _gain(self, S: Sim3) -> Array:
-        there = S.scale[:, None, None] * np.einsum("hij,mj->hmi", S.rotation, self._a) + S.translation[:, None]
-        off = np.linalg.norm(there - self._b, axis=2) / self._sigma
+        there = S.scale[:, None, None] * (S.rotation @ self._a.T) + S.translation[:, :, None]
+        off = ((there - self._b.T) ** 2).sum(axis=1) / self._sigma**2
         sized = np.abs(self._log_size - np.log(S.scale)[:, None]) < self._s.size_range
-        return np.asarray(np.where(sized, self._odds * np.maximum(0.0, 1.0 - (off / 2.5) ** 2), 0.0))
+        return np.asarray(np.where(sized, self._odds * np.maximum(0.0, 1.0 - off / 2.5**2), 0.0))
 
     def refined(self, S: Sim3, metric: bool) -> ConstellationMatch | None:
         """Return the match that a similarity grows to, None where less than three things agree."""

@@ -74,7 +74,7 @@ class ConstellationRegistrationSettings:
     """Things that must still agree once surfaces were brought together, for a relation to be believed."""
     least_belief: float = 3.1
     """Least log odds that a relation is right (`BeliefWeights`) for it to be believed."""
-    least_fitting: float = 0.14
+    least_fitting: float = 0.1
     """Share of a chunk's surface that must meet the other's: with less a relation is loose."""
     most_rival: float = 0.9
     """Another relation of the same chunks must have less of the believed one's support than this."""

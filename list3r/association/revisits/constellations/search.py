@@ -1,14 +1,14 @@
 """Find loop closures by things alone, where frames that look alike join a chunk to nothing.
 
 What is apart from the new chunk (another session, what lies behind a jump of the picture) is matched whole; of what is
-tied to it only what lies near by as the chain of edges has it. Registration costs a tenth of a second for each pair
-of chunks, so it is asked only where appearance did not suffice.
+tied to it only what lies near by as the chain of edges has it. A chunk is registered with its surroundings
+(`surroundings`), which takes half a second a pair, so it is asked only where appearance did not suffice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +24,20 @@ from list3r.association.revisits.constellations.registration import (
     ConstellationRegistrationSettings,
     RegisteredChunk,
     Registration,
+    belief,
     covariance,
     doubt,
     register,
 )
 from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
+from list3r.association.revisits.constellations.surroundings import Neighbour, SurroundingsSettings, gather
 from list3r.association.revisits.cross_check import Side
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge
 from list3r.memory.store.store import Store
 
 Array = NDArray[np.float64]
+_BELIEF = "things_belief"
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,21 @@ class ThingSearchSettings:
     enabled: bool = True
     most_apart: int = 60
     """Most chunks apart from the new one whose things are matched, spread over all of them."""
+    places: int = 4
+    """Most chunks that are registered for how well their things match,"""
     registered: int = 6
-    """Most pairs of chunks that are registered, those whose things match best."""
+    """and most with those that surround the best ones, which tell the place once more."""
     near: float = 1.5
     """Chunks tied to the new one are asked where they lie this near, shares of both typical depths."""
     most_near: int = 4
     most_looked: int = 16
     """Chunks whose origins lie nearest, of which it is asked how near they lie; reading all takes long."""
+    least_lead: float = 2.0
+    """Least difference of the log odds of a believed relation and of any that puts the new chunk elsewhere."""
+    elsewhere: float = 1.5
+    """Deviations of the way between two relations from which on they name two places. What lies in one is mostly found
+    within 0.3; look-alike rooms of one floor lie 2.7 and more apart (docs/decisions/0147)."""
+    surroundings: SurroundingsSettings = field(default_factory=SurroundingsSettings)
     registration: ConstellationRegistrationSettings = field(default_factory=ConstellationRegistrationSettings)
 
 
@@ -58,7 +69,8 @@ class ThingSearchSettings:
 class _Known:
     """Constellations of an open store, by chunk and what could change them."""
 
-    by_chunk: dict[int, tuple[object, Constellation]] = field(default_factory=dict)
+    by_chunk: dict[tuple[int, ...], tuple[object, Constellation]] = field(default_factory=dict)
+    """Of surroundings, by their chunks, the one in the middle first."""
     middles: dict[int, tuple[int | None, Array, float]] = field(default_factory=dict)
     """Checksum, middle of the samples (3,) and typical depth of chunks, chunk units."""
 
@@ -77,27 +89,34 @@ class ThingSearch:
         self._store, self._rows, self._id, self._side, self._settings = store, rows, chunk_id, side, settings
         self._known = store.derived.of(_Known)
         self._checksums = store.chunks.checksums()
+        self._neighbours = _neighbours_in_time(store.edges.all(), chunk_id)
+        self._here: dict[int, Sim3] = self._members(chunk_id, {})
 
     def edges(self, apart: Sequence[int], tied: Sequence[int], ways: Ways, most_deviations: float) -> list[Edge]:
         """Return loop edges, accepted or rejected, to the chunks that are worth it."""
         s = self._settings
         pick = np.linspace(0, len(apart) - 1, min(len(apart), s.most_apart)).astype(np.int64)
-        wanted = [apart[k] for k in pick.tolist()] + self._near(tied)
-        if not wanted:
+        members: dict[int, dict[int, Sim3]] = {}
+        for u in [apart[k] for k in pick.tolist()]:
+            if not any(u in held for held in members.values()):
+                members[u] = self._members(u, self._here)
+        members |= {u: self._members(u, self._here) for u in self._near(tied) if u not in self._here}
+        if not members:
             return []
-        here = self._constellation(self._id)
+        here = self._constellation(self._here)
         likely = []
-        for u in wanted:
-            matches = match_constellations(self._constellation(u), here, self._metric(u), s.registration.matching)
+        for u in members:
+            there = self._constellation(members[u])
+            matches = match_constellations(there, here, self._metric(u), s.registration.matching)
             best = max((m.score for m in matches if len(m.pairs) >= s.registration.least_pairs), default=0.0)
             if best >= s.registration.least_match:
                 likely.append((-best, u))
         if not likely:
             return []
-        new = self._place(self._id)
+        new = self._place(self._here)
         out = []
-        for _, u in sorted(likely)[: s.registered]:
-            old = self._place(u)
+        for u in self._places([u for _, u in sorted(likely)], members, apart):
+            old = self._place(members.setdefault(u, self._members(u, self._here)))
             found = register(old, new, self._metric(u), s.registration)
             if found is not None:
                 way = ways.predict(u, self._id) if u in tied else None
@@ -106,7 +125,26 @@ class ThingSearch:
                 if against is None and off is not None and off > most_deviations:
                     against = f"the way between the chunks contradicts it by {off:.0f} deviations"
                 out.append(self._edge(u, old, new, found, against))
-        return out
+        return [self._outdone(e, out, ways) for e in out]
+
+    def _places(self, likely: list[int], members: Mapping[int, Mapping[int, Sim3]], apart: Sequence[int]) -> list[int]:
+        """Return the chunks whose surroundings are registered: the likely ones, then what surrounds the likeliest."""
+        near = [n for u in likely for n in members[u] if n in apart and n not in likely]
+        return list(dict.fromkeys([*likely[: self._settings.places], *near]))[: self._settings.registered]
+
+    def _outdone(self, edge: Edge, found: Sequence[Edge], ways: Ways) -> Edge:
+        """Return an edge, rejected where about as much speaks for one that names another place."""
+        if not edge.accepted:
+            return edge
+        lead = float("inf")
+        for other in found:
+            way = ways.predict(other.u, self._id, [edge]) if other is not edge else None
+            if way is not None and way.deviations(other.S_v_u) > self._settings.elsewhere:
+                lead = min(lead, edge.scores[_BELIEF] - other.scores[_BELIEF])
+        if lead >= self._settings.least_lead:
+            return edge
+        why = f"another place fits about as well (log odds {lead:+.1f}); {edge.reason}"
+        return replace(edge, accepted=False, weight=0.0, reason=why)
 
     def _near(self, tied: Sequence[int]) -> list[int]:
         """Return the tied chunks whose things lie nearest to those of the new one, as the neighbour's edge has it."""
@@ -139,18 +177,41 @@ class ThingSearch:
     def _metric(self, u: int) -> bool:
         return self._rows[u].scale_kind == self._rows[self._id].scale_kind == "metric"
 
-    def _constellation(self, chunk_id: int) -> Constellation:
-        state = self._checksums.get(chunk_id), self._store.local_instances.signature(chunk_id)
-        held = self._known.by_chunk.get(chunk_id)
+    def _members(self, chunk_id: int, without: Mapping[int, Sim3]) -> dict[int, Sim3]:
+        """Return S_here_chunk of a chunk and of its surroundings, by their ids, itself first."""
+        s = self._settings.surroundings
+        out, edge = {chunk_id: Sim3.identity()}, [chunk_id]
+        for _ in range(s.steps):
+            step = [(k, n, S_k_n) for k in edge for n, S_k_n in self._neighbours.get(k, ()) if n not in out]
+            out |= {n: out[k] @ S_k_n for k, n, S_k_n in step}
+            edge = [n for _, n, _ in step]
+        middle, depth = self._middle(chunk_id, Sim3.identity())
+        off = {n: float(np.linalg.norm(self._middle(n, S)[0] - middle)) / depth for n, S in out.items()}
+        size = self._rows[chunk_id].image_size
+        near = [n for n in out if off[n] <= s.near and n not in without and self._rows[n].image_size == size]
+        near = [n for n in near if n != chunk_id]
+        return {n: out[n] for n in [chunk_id, *sorted(near, key=lambda n: (off[n], n))[: s.chunks - 1]]}
+
+    def _constellation(self, members: Mapping[int, Sim3]) -> Constellation:
+        key = tuple(members)
+        state = tuple((self._checksums.get(n), self._store.local_instances.signature(n)) for n in key)
+        held = self._known.by_chunk.get(key)
         if held is None or held[0] != state:
-            nodes = self._store.local_instances.nodes([chunk_id])
-            space = self._store.chunks.feature_space(chunk_id)
-            made = make_constellation(nodes, self._side(chunk_id), space, self._settings.registration.constellation)
-            held = self._known.by_chunk[chunk_id] = state, made
+            held = self._known.by_chunk[key] = state, self._made(members)[0]
         return held[1]
 
-    def _place(self, chunk_id: int) -> RegisteredChunk:
-        c, side = self._constellation(chunk_id), self._side(chunk_id)
+    def _made(self, members: Mapping[int, Sim3]) -> tuple[Constellation, Side]:
+        s = self._settings
+        nodes = {n: self._store.local_instances.nodes([n]) for n in members}
+        space = self._store.chunks.feature_space(next(iter(members)))
+        parts = [Neighbour(S, nodes[n], self._side(n)) for n, S in members.items()]
+        things, side = gather(parts, space, s.surroundings)
+        how = s.registration.constellation
+        how = how if len(parts) == 1 else replace(how, most_instances=s.surroundings.most_instances)
+        return make_constellation(things, side, space, how), side
+
+    def _place(self, members: Mapping[int, Sim3]) -> RegisteredChunk:
+        c, side = self._made(members)
         return RegisteredChunk(c, ChunkSurfaces(side, c.unit, self._settings.registration.surfaces), side)
 
     def _middle_keyframe(self, chunk_id: int) -> int:
@@ -179,7 +240,18 @@ class ThingSearch:
             residual_m=found.fit.residual * new.constellation.unit,
             accepted=against is None,
             reason=f"{agree}; {against}" if against else f"{agree}, and surfaces with them",
-            scores={f"things_{name}": value for name, value in found.scores.items()},
+            scores={f"things_{name}": value for name, value in found.scores.items()}
+            | {_BELIEF: belief(found.scores, self._settings.registration.belief)},
             frames=(self._middle_keyframe(u), self._middle_keyframe(self._id)),
             covariance=covariance(old, self._metric(u), self._settings.registration),
         )
+
+
+def _neighbours_in_time(edges: Sequence[Edge], last: int) -> dict[int, list[tuple[int, Sim3]]]:
+    """Return the chunks up to the last one that the camera went through before and after each, and S_chunk_other."""
+    out: dict[int, list[tuple[int, Sim3]]] = {}
+    for e in edges:
+        if e.kind == "adjacent" and e.accepted and max(e.u, e.v) <= last:
+            out.setdefault(e.u, []).append((e.v, e.S_v_u.inverse()))
+            out.setdefault(e.v, []).append((e.u, e.S_v_u))
+    return out
