@@ -202,7 +202,6 @@ def _without_instances(revisits: Any) -> Any:
     return replace(
         revisits,
         lambda_=1.0,
-        least_score=0.0,
         layout_pairs=10**6,
         things=replace(revisits.things, enabled=False),
         window=replace(revisits.window, cross=cross),
@@ -458,24 +457,31 @@ def revisit_table(
 
 
 def plot(path: Path, rows: Sequence[dict[str, Any]], presets: Sequence[str], variants: Sequence[str]) -> None:
-    """ATE of every seed (dots) and their mean (bars), one panel a preset."""
+    """ATE of every seed (dots) and their median (lines), one panel a preset, logarithmic."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(presets), figsize=(2.4 * len(presets) + 1, 3.6), squeeze=False)
+    size = (1.7 * len(presets) + 2.4, 0.26 * len(variants) + 0.9)
+    figure, axes = pyplot.subplots(1, len(presets), figsize=size, squeeze=False, sharex=True, sharey=True)
     for axis, preset in zip(axes[0], presets, strict=True):
         for k, variant in enumerate(variants):
             ates = [r["ate_sim3_m"] for r in rows if (r["preset"], r["variant"]) == (preset, variant)]
-            axis.bar(k, np.mean(ates), color="#9fc5e8" if k < len(variants) - 1 else "#2a6fb0")
-            axis.scatter(np.full(len(ates), k), ates, s=9, color="#333333", zorder=3)
-        axis.set_xticks(range(len(variants)), [TITLES[v] for v in variants], rotation=40, ha="right", fontsize=8)
+            color = "#2a6fb0" if variant.startswith("full") else "#777777"
+            axis.plot([np.median(ates)] * 2, [k - 0.35, k + 0.35], color=color, linewidth=2)
+            axis.scatter(ates, np.full(len(ates), k), s=12, color=color, alpha=0.55, linewidths=0)
         axis.set_title(preset, fontsize=10)
-        axis.set_ylim(bottom=0)
-    axes[0][0].set_ylabel("ATE after Sim(3) alignment, m")
+        axis.grid(axis="x", color="#dddddd", linewidth=0.6)
+        axis.tick_params(labelsize=8, length=0)
+    axes[0][0].set_xscale("log")
+    axes[0][0].set_xticks([0.03, 0.1, 0.3, 1, 3], ["0.03", "0.1", "0.3", "1", "3"])
+    axes[0][0].set_xticks([], minor=True)
+    axes[0][0].set_yticks(range(len(variants)), [TITLES[v] for v in variants])
+    axes[0][0].invert_yaxis()
+    figure.supxlabel("ATE after Sim(3) alignment, m", fontsize=9)
     figure.tight_layout()
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=130)
 
 
 if __name__ == "__main__":

@@ -165,12 +165,6 @@ def discovery() -> str:
     return _table(["recall, precision of one chunk", *keys], rows)
 
 
-BEFORE = {
-    "baseline": "baseline: edges by confidence, every frame similarity above 0.85 a loop, no cut detection",
-    "ilrd": "+ cut detection, verified loops (ILRD)",
-    "iasm": "+ instance-aware support (IASM)",
-    "cwgo": "+ graph with covariances, and nodes within chunks (full)",
-}
 """Variants of results that were measured before VGGT-Long was written anew."""
 VARIANTS = {
     "vggt-long": "VGGT-Long, its own loop selection, alignment and optimiser; no cut detection",
@@ -209,11 +203,6 @@ def _ate_table(runs: Sequence[Any], names: dict[str, str], reference: str) -> st
         rows.append([names[variant], *cells, f"{over_all[0]:.3f}, x {over_all[0] / over_all[1]:.2f}"])
     heads = [f"{p} ({n})" for p, n in counts.items()]
     return _table(["ATE, m: mean (median, worst), ratio of medians", *heads, "median of all"], rows)
-
-
-def association() -> str:
-    """Return the table of the variants of association as they were before VGGT-Long was written anew."""
-    return _ate_table(_read("association")["runs"], BEFORE, "baseline")
 
 
 def fair() -> str:
@@ -409,7 +398,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "kitchen": kitchen,
     "walks": walks,
     "discovery": discovery,
-    "association": association,
     "fair": fair,
     "returns": returns,
     "registration": registration,

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.stats import chi2
 
 from list3r.association.revisits.frame_search import TRAINED, SearchSettings, choose
 from list3r.association.revisits.scaled_verification import verify_scaled
-from list3r.association.revisits.search import find_loops
+from list3r.association.revisits.search import RevisitSettings, find_loops
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
@@ -242,6 +243,29 @@ def test_what_fits_two_places_of_a_part_apart_is_not_believed(here: Keyframe, ag
     )
     edges = find_loops(Chunks([(here,), (twin,), elsewhere, (again,)], known=[between, tied]), 3)
     assert [e.u for e in edges if e.accepted] == [1]
+
+
+def test_things_tell_which_of_two_places_that_frames_say_is_right(here: Keyframe, again: Keyframe) -> None:
+    apart = Sim3.exp([4.0, 0, 0, 0, 0, 0, 0])
+    kinds = {"confidence": 0.9, "weight": 0.9, "inliers": 99, "residual_m": 0.0, "accepted": True, "reason": ""}
+    said = {"scores": {"spread": 3.0}, "covariance": 1e-6 * np.eye(7), **kinds}
+    between = Edge(0, 1, "adjacent", apart, **said)
+    told = Edge(1, 3, "loop", Sim3.from_matrix(GAUGE), **said)
+    twin, elsewhere = replace(here, frame_index=100), keyframes_at(3.0, first=150)
+    with patch("list3r.association.revisits.search.ThingSearch.edges", return_value=[told]):
+        edges = find_loops(Chunks([(here,), (twin,), elsewhere, (again,)], known=[between]), 3)
+    assert {e.u for e in edges if e.accepted} == {1}
+    assert any(e.accepted and e is not told for e in edges)
+
+
+def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyframe, again: Keyframe) -> None:
+    noise = np.random.default_rng(0).normal(0, 1, len(again.descriptor))
+    mixed = again.descriptor + 3 * noise / np.linalg.norm(noise)
+    less = replace(again, descriptor=mixed / np.linalg.norm(mixed), keypoints_xy=again.keypoints_xy[:0])
+    for verified in (False, True):
+        edges = find_loops(Chunks([(here,), (), (less,)]), 2, settings=RevisitSettings(verified=verified))
+        assert len(edges) == 1 and edges[0].scores["s_det"] < 0.85
+        assert ("not alike enough" in edges[0].reason) is not verified
 
 
 def test_chunks_without_keyframes_or_with_broken_descriptors(here: Keyframe, again: Keyframe) -> None:

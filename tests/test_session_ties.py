@@ -51,6 +51,14 @@ def test_two_of_the_same_chunks_count_when_their_frames_lie_apart(frames: tuple[
     assert _accepted([*INSIDE, one, replace(two, S_v_u=_edge(1, 3, off_m=2.0).S_v_u)])[3:] == [False, False]
 
 
+def test_one_by_frames_and_one_by_things_place_a_session_though_of_the_same_chunks() -> None:
+    frames, things = (replace(_edge(1, 3, off_m=x), frames=(2, 5)) for x in (0.0, 0.05))
+    things = replace(things, scores={"things_pairs": 10.0})
+    assert _accepted([*INSIDE, frames, things])[3:] == [True, True]
+    assert _accepted([*INSIDE, things, replace(things, frames=(3, 6))])[3:] == [False, False]
+    assert _accepted([*INSIDE, frames, replace(things, S_v_u=_edge(1, 3, off_m=2.0).S_v_u)])[3:] == [False, False]
+
+
 def test_a_relation_says_which_other_keyframes_see_the_same() -> None:
     """Cameras that turn on the spot, two chunks in gauges of their own; a frame of v looks where that of u does."""
     frames = np.arange(0, 60, 5)

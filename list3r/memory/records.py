@@ -301,6 +301,11 @@ class Edge:
     """Of the tangent error x in S_true = S_v_u exp(x), x = (rho, omega, sigma) in u's units; None where it is not
     known. Shape (7, 7)."""
 
+    @property
+    def by_things(self) -> bool:
+        """True where things alone gave the relation, not frames."""
+        return "things_pairs" in self.scores
+
 
 @dataclass(frozen=True)
 class FrameRow:

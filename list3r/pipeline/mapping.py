@@ -123,7 +123,7 @@ def _prior_edge(store: Store, session_id: int, result: ChunkResult, how: Associa
 
 def _refined(store: Store, edge: Edge, settings: ReprojectionSettings) -> Edge:
     """A loop between chunks of structure from motion, refined by where features are seen; not one by things alone."""
-    if edge.frames is None or "things_pairs" in edge.scores:
+    if edge.frames is None or edge.by_things:
         return edge
     owner = {c.chunk_id: c for c in store.chunks.all()}
     u, v = owner[edge.u], owner[edge.v]

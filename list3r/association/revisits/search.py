@@ -1,10 +1,10 @@
 """Find loop closures (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
 
 Frame descriptors propose with a relaxed threshold (`frame_search`); the two chunks' instances add s_sem and s_rel
-(`instance_cues`); what s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel) holds likely is verified by the keyframes'
-features and depth where they have them (`verification`), else by a joint window (`joint_window`); and nothing is
-believed that the way the camera went contradicts (`chain`). Every candidate becomes an edge, accepted or not, with its
-scores and the reason. How the weights were chosen: docs/decisions/0045.
+(`cues`); the likeliest by s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel) are verified by the keyframes' features
+and depth where they have them (`verification`), else by a joint window (`joint_window`); and nothing is believed that
+the way the camera went contradicts (`chain`). Every candidate becomes an edge, accepted or not, with its scores and
+the reason. How the weights were chosen: docs/decisions/0045.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class RevisitSettings:
     lambda_: float = 0.5
     """Weight of frame similarity in s_loop (the paper gives none)."""
     least_score: float = 0.7
-    """Least s_loop of a candidate that is worth a joint window, unless its frames alone are alike enough."""
+    """Least s_loop of a candidate where relations are not verified, unless its frames alone are alike enough. Verified
+    ones are only ranked by it (docs/decisions/0149)."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
     enough: int = 8
@@ -119,16 +120,19 @@ def find_loops(
     """
     chosen = settings or RevisitSettings()
     look = _Lookout(store, chunk_id, chosen)
-    edges = _by_frames(store, chunk_id, look, joint, chosen)
-    if chosen.things.enabled and chosen.instance_cues and chosen.verified:
-        edges = look.unambiguous([*edges, *look.by_things(edges)])
+    found = _by_frames(store, chunk_id, look, joint, chosen)
+    if not chosen.verified:
+        return found
+    edges = look.unambiguous(found)
+    if chosen.things.enabled and chosen.instance_cues and (told := look.by_things(edges)):
+        edges = look.unambiguous([*found, *told])  # things also tell which of several places that frames say is right
     return edges
 
 
 def _by_frames(
     store: Store, chunk_id: int, look: _Lookout, joint: JointReconstructor | None, chosen: RevisitSettings
 ) -> list[Edge]:
-    """Find the loop edges between a chunk and those of which frames look like its own."""
+    """Find the loop edges between a chunk and those of which frames look like its own; these may contradict."""
     candidates = find_candidates(store, chunk_id, chosen.search)
     edges: list[Edge] = []
     tried = 0
@@ -148,9 +152,7 @@ def _by_frames(
         edges.append(_with_scores(edge, scored))
     if chosen.verified and (alone := look.alone(edges)) is not None:
         edges += look.second_looks(alone, {e.frames for e in edges if e.u == alone.u})
-    if chosen.verified and chosen.all_keyframes.chunks:
-        edges = look.by_all_keyframes(edges)
-    return look.unambiguous(edges) if chosen.verified else edges
+    return look.by_all_keyframes(edges) if chosen.verified and chosen.all_keyframes.chunks else edges
 
 
 def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSettings) -> list[_Scored]:
@@ -224,11 +226,10 @@ class _Lookout:
         return self._cues[u]
 
     def unlikely(self, scored: _Scored) -> bool:
-        """Tell whether a candidate is not worth a try: instances only rank those whose keyframes tell cheaply and
-        surely."""
+        """Tell whether a candidate is not worth a try: instances only rank those that are verified."""
         if not self._settings.instance_cues:
             return True
-        return scored.score < self._settings.least_score and not all(map(_tells, self._keyframes(scored.candidate)))
+        return not self._settings.verified and scored.score < self._settings.least_score
 
     def _keyframes(self, c: Candidate) -> tuple[Keyframe, Keyframe]:
         return self._store.keyframes.get(c.u, c.frame_u), self._store.keyframes.get(self._id, c.frame_v)

@@ -35,14 +35,15 @@ class FramesApart:
 def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
     """Tell whether two relations of two sessions speak for each other.
 
-    Those of one pair of chunks do where their frames lie apart. Those of two pairs do not where they share a keyframe:
-    what misled one misleads the other (docs/decisions/0058). `session_of` gives the session of every chunk.
+    Those of one pair of chunks do where their frames lie apart, or where one is by frames and the other by things.
+    Those of two pairs do not where they share a keyframe: what misled one misleads the other (docs/decisions/0058).
+    `session_of` gives the session of every chunk.
     """
     one_pair = (e.u, e.v) == (f.u, f.v)
     if e.frames is None or f.frames is None:
         return not one_pair
     if one_pair:
-        return apart.of(e.frames, f.frames)
+        return e.by_things != f.by_things or apart.of(e.frames, f.frames)
     return not keyframes_of(e, session_of) & keyframes_of(f, session_of)
 
 

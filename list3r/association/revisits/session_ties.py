@@ -1,7 +1,8 @@
 """Decide whether a session is placed in the world of another: by two relations that agree, or by one beyond doubt.
 
-Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart. One is
-beyond doubt when many features hold it, or when the whole of both chunks speaks for it (docs/decisions/0134).
+Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart, or one
+is by frames and one by things. One is beyond doubt when many features hold it, or when the whole of both chunks speaks
+for it (docs/decisions/0134).
 
 Within one video neighbouring chunks share frames, and a false loop is caught by the chain. Nothing catches a false
 relation that alone ties one session to another: the whole session would land on top of the old world in a wrong place.
