@@ -8,8 +8,8 @@ near the same places. `list3r build` makes a memory of the first walk, `list3r u
 counts as placed where all its chunks lie in the world of the first and its cameras are off by at most 0.1 m and 3
 degrees (medians) when the world is laid on the truth by the cameras of the first session alone, turned by their mean
 rotation. What stands in the JSON already is not done again, and walks and memories in --keep are used as they are.
-With --strangers the keyframes of every home's first session are compared with those of the other homes' second ones,
-which must never be believed.
+With --strangers the second session of each next home is added to the memory of a home in --keep, where it must stay
+apart.
 """
 
 from __future__ import annotations
@@ -29,11 +29,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.simulation.walks import HomeSessionWalk
-from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.all_keyframes import place_by_all_keyframes
 from list3r.evaluation.trajectory import Trajectory, associate, read_tum
 from list3r.memory.geometry import Sim3
-from list3r.memory.records import Keyframe
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import write_walk
 from list3r.simulation.rendering.shading import EVENING
@@ -47,13 +44,11 @@ def main() -> None:
     parser.add_argument("--seeds", default="401-420", help="first-last")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
-    parser.add_argument("--strangers", action="store_true", help="compare keyframes of different homes in --keep")
+    parser.add_argument("--strangers", action="store_true", help="add sessions to memories of other homes in --keep")
     words = parser.parse_args()
     first, last = (int(n) for n in words.seeds.split("-"))
     if words.strangers:
-        found = strangers([words.keep / str(seed) / "two.l3r" for seed in range(first, last + 1)])
-        print(json.dumps(found))
-        write_json(words.json, {"strangers": found})
+        write_json(words.json, strangers(words.keep, range(first, last + 1)))
         return
     rows = json.loads(words.json.read_text())["homes"] if words.json and words.json.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
@@ -123,32 +118,22 @@ def offset(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[flo
     return float(np.median(off_m)), float(np.degrees(np.median(turned.magnitude())))
 
 
-def strangers(memories: Sequence[Path]) -> dict[str, int]:
-    """How many pairs of keyframes of different homes are believed to show one place, of how many; the same at home.
-
-    And in how many pairs of sessions all keyframes of both place one beside the other.
-    """
-    keyframes = [_keyframes(path) for path in memories if path.exists()]
-    counts = dict.fromkeys(("sessions", "placed", "pairs", "believed"), 0)
-    counts |= {f"{name}_at_home": 0 for name in counts}
-    for (a, (first, _)), (b, (_, second)) in itertools.product(enumerate(keyframes), repeat=2):
-        edges = [verify(u, v, 0, 1, later=True) for u in first for v in second]
-        where = "_at_home" if a == b else ""
-        counts[f"sessions{where}"] += 1
-        counts[f"placed{where}"] += bool(place_by_all_keyframes((0, first), (1, second), VerificationSettings()))
-        counts[f"pairs{where}"] += len(edges)
-        counts[f"believed{where}"] += sum(e.accepted for e in edges)
-    return counts
-
-
-def _keyframes(path: Path) -> tuple[list[Keyframe], list[Keyframe]]:
-    """The keyframes of both sessions of a memory that can be compared."""
-    out: tuple[list[Keyframe], list[Keyframe]] = ([], [])
-    with Store.open(path) as store:
-        for chunk in store.chunks.all():
-            found = store.keyframes.of(chunk.chunk_id)
-            out[chunk.session_id - 1].extend(k for k in found if k.depth_small.size and len(k.keypoints_xy))
-    return out
+def strangers(keep: Path, seeds: Sequence[int]) -> dict[str, Any]:
+    """Add the second session of each next home to the memory of a home, where it must stay apart."""
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for home, other in itertools.pairwise(seeds):
+            memory = Path(scratch) / f"{home}-{other}.l3r"
+            shutil.copy(keep / str(home) / "one.l3r", memory)
+            run_list3r(
+                "update", str(memory), str(keep / str(other) / "second"), "--poses", "estimate", "--workers", "1"
+            )
+            with Store.open(memory) as store:
+                chunks = store.chunks.all()
+                placed = sum(c.component == chunks[0].component for c in chunks if c.session_id == 2)
+                rows.append({"home": home, "session_of": other, "in_world": placed, "loops": _between_sessions(store)})
+            print(json.dumps(rows[-1]), flush=True)
+    return {"sessions": len(rows), "placed": sum(r["in_world"] > 0 for r in rows), "of": rows}
 
 
 def _between_sessions(store: Store) -> list[dict[str, Any]]:
