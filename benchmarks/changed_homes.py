@@ -120,7 +120,7 @@ def offset(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[flo
 
 def strangers(keep: Path, seeds: Sequence[int]) -> dict[str, Any]:
     """Add the second session of each next home to the memory of a home, where it must stay apart."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
         for home, other in itertools.pairwise(seeds):
             memory = Path(scratch) / f"{home}-{other}.l3r"

@@ -237,9 +237,16 @@ def registration() -> str:
 def changed() -> str:
     """Return the table of second sessions after heavy change."""
     whole, alone = _read("changed-homes")["total"], _read("changed-keyframes")["total"]
+    strangers = _read("changed-strangers")
     rows = []
     for name, t, placed, wrong, others in (
-        ("build and update", whole, whole["placed"], whole["wrong"], "not measured"),
+        (
+            "build and update",
+            whole,
+            whole["placed"],
+            whole["wrong"],
+            f"{strangers['placed']} of {strangers['sessions']}",
+        ),
         (
             "keyframes alone, at true poses",
             alone,
