@@ -29,7 +29,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import machine, write_json
+
+from benchmarks.machine import machine, write_json
 
 RIGHT_M, RIGHT_DEG = 0.35, 8.0
 CLOSE_M, CLOSE_DEG = 0.1, 3.0
