@@ -165,7 +165,6 @@ def discovery() -> str:
     return _table(["recall, precision of one chunk", *keys], rows)
 
 
-"""Variants of results that were measured before VGGT-Long was written anew."""
 VARIANTS = {
     "vggt-long": "VGGT-Long, its own loop selection, alignment and optimiser; no cut detection",
     "vggt-long-cuts": "the same, cuts given (as in all rows below)",
