@@ -27,7 +27,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalInstance
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunks.chunk import ChunkTask, process_chunk
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
@@ -44,8 +44,8 @@ def main() -> None:
     source = open_source(words.source, options)
     count = min(source.info.frame_count, words.frames or source.info.frame_count)
     tasks = [ChunkTask(str(words.source), options, span, settings) for span in plan_chunks(count, settings.chunks)]
-    with OrderedPool(process_chunk, default_workers()) as pool:
-        results = list(pool.map(tasks))
+    with OrderedPool(process_parts, default_workers()) as pool:
+        results = [parts[-1] for parts in pool.map(tasks)]
     frames = [f for f in source.read(0, count) if isinstance(f, Frame) and f.T_source_cam is not None]
     truth = Trajectory(np.array([f.time_s for f in frames]), np.stack([np.asarray(f.T_source_cam) for f in frames]))
     with threadpool_limits(1):

@@ -39,7 +39,7 @@ from list3r.instances.neural.candidates import plane_of_mask, without_spill
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunks.chunk import ChunkTask, process_chunk
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.queries.relations import VERTICAL
@@ -141,7 +141,7 @@ def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str
     told: dict[tuple[int, int], int] = {}
     for span in plan_chunks(source.info.frame_count, settings.chunks):
         discoverer = ToldMasks(walk, truth, settings.instances)
-        result = process_chunk(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)
+        result = process_parts(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)[-1]
         chunk = add_chunk(store, session, result)
         for instance in result.library.instances:
             told[chunk, instance.local_id] = _true_id(walk, instance.track)

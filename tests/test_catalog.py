@@ -19,7 +19,7 @@ import pytest
 
 from list3r.catalog import Catalog
 from list3r.catalog.base import open_backend
-from list3r.catalog.catalog import aabb_distance, box_distances
+from list3r.catalog.catalog import box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.cli.app import run as list3r
@@ -109,7 +109,7 @@ def test_within_are_the_boxes_that_meet_a_region(catalog: Catalog) -> None:
     assert inside == {t.id for t in passing(CatalogFilters()) if box_distance(t, middle) <= 0.8}
     met = {m.id for m in catalog.within("random", lower=middle - 1, upper=middle + 1)}
     assert inside <= met
-    assert all(aabb_distance(t, middle) > 1 for t in passing(CatalogFilters()) if t.id not in met)
+    assert all(t.aabb_distance(middle) > 1 for t in passing(CatalogFilters()) if t.id not in met)
 
 
 def test_places_of_one_memory_are_found_by_the_index_of_memory_and_box(server: PostgresServer) -> None:

@@ -139,7 +139,7 @@ class Catalog:
             entry, near = _of(memory, self._backend.near(printable(memory), at.tolist(), count, filters))
             found = [f for f in _by_distance(near, at) if f[1] != own][:k]
             # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
-            if len(near) < count or (len(found) == k and found[-1][0] <= aabb_distance(near[-1], at)):
+            if len(near) < count or (len(found) == k and found[-1][0] <= near[-1].aabb_distance(at)):
                 break
             count *= 4
         whence = "the point" if own is None else f"the centre of #{own}"
@@ -352,12 +352,6 @@ def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> 
     """Return things with the distance of a point from their boxes and their number, the nearest first."""
     held = zip(box_distances(things, point).tolist(), things, strict=True)
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
-
-
-def aabb_distance(thing: CatalogThing, point: NDArray[np.float64]) -> float:
-    """Return the distance of a point from the axis-aligned box of a thing, 0 inside, world units."""
-    low, high = map(np.array, thing.bounds())
-    return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))
 
 
 def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, told: Sequence[Any]) -> CatalogMatch:

@@ -163,7 +163,7 @@ class SqliteBackend:
         reach, farthest = 1.0, np.inf
         while True:
             found = self._inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
-            gaps = [_gap(t, at) for t in found]
+            gaps = [t.aabb_distance(at) for t in found]
             if sum(g <= reach for g in gaps) >= k or reach >= farthest:
                 order = sorted(range(len(found)), key=lambda n: (gaps[n], found[n].id))
                 return [found[n] for n in order[:k]]
@@ -365,8 +365,3 @@ def unit_vectors(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return vectors of length one. Shape (N, D)."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float32)
-
-
-def _gap(thing: CatalogThing, point: NDArray[np.float64]) -> float:
-    low, high = map(np.array, thing.bounds())
-    return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))

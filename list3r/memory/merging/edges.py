@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.constraints import ConstraintCheck, Constraints
+from list3r.memory.constraints import ConstraintCheck, Constraints, key_name
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.merging.settings import MergeSettings
@@ -260,7 +260,7 @@ def _join(
             continue
         against = "" if check is None else check.objection(t.keys[x], t.keys[y])
         against = against or _too_long(t, clusters, a, b, s) or _objection(t, clusters, a, b, overlaps, s)
-        names, scores = (_name(t.keys[x]), _name(t.keys[y])), links.scores_of(n)
+        names, scores = (key_name(t.keys[x]), key_name(t.keys[y])), links.scores_of(n)
         if against:
             refused.add((a, b))
             decisions.append(MergeDecision("refuse", *names, scores, against))
@@ -286,7 +286,7 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
     members = clusters.members[a], clusters.members[b]
     seen_apart = clusters.foes[a].intersection(members[1])
     if seen_apart:
-        return f"{_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
+        return f"{key_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
     one, other = (np.array(ns)[t.truncated[ns] < s.min_truncated] for ns in members)
     left, right = (x.ravel() for x in np.meshgrid(one, other, indexing="ij"))
     whole = np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
@@ -301,7 +301,3 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
     if apart.sum() > s.max_conflicts * len(compared):
         return f"{int(apart.sum())} of {len(compared)} pairs of whole views lie apart"
     return ""
-
-
-def _name(key: Key) -> str:
-    return f"{key[0]}:{key[1]}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import sqlite3
@@ -339,3 +340,9 @@ def migrate(database: sqlite3.Connection, version: int) -> None:
         if database.in_transaction:
             database.execute("ROLLBACK")
         raise
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

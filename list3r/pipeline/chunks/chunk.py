@@ -54,18 +54,12 @@ class ChunkTask:
     """By Frame.index, where the whole video was mapped before its chunks."""
 
 
-def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
-    """Frames of one chunk to poses, keyframes and a local instance library; the last part of one that falls apart.
-
-    A `discoverer` stands in for the one that the settings name.
-    """
-    return process_parts(task, discoverer)[-1]
-
-
 def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tuple[ChunkResult, ...]:
-    """As `process_chunk`, but all parts of a chunk through which the camera could not be followed, in order of time.
+    """Turn the frames of one chunk into poses, keyframes and local instances.
 
-    The last part has the number of the span, so that the span is done when that part is stored.
+    A chunk through which the camera could not be followed falls into several parts, in order of time. The last part
+    has the number of the span, so that the span is done when that part is stored. A `discoverer` stands in for the one
+    that the settings name.
     """
     clock = _Clock()
     source = _source(task.path, task.options)
