@@ -49,9 +49,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
     "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config", "serve"),
     "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
-    "Hand over": ("export", "catalog"),
-    "Measure": ("eval",),
-    "Keep": ("verify", "repair", "doctor", "models"),
+    "Export": ("export", "catalog"),
+    "Evaluate": ("eval",),
+    "Maintain": ("verify", "repair", "doctor", "models"),
 }
 """What commands are for, in the order of the help."""
 
@@ -114,7 +114,7 @@ def commands(asked: str | None = None) -> Any:
     return typer.main.get_command(app)
 
 
-def _version(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+def _version(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
     if version:
         from list3r import __version__
 

@@ -64,7 +64,7 @@ def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
     """The same command with `--at SESSION`, which `open_memory` obeys while it runs."""
     signature = inspect.signature(command, eval_str=True)
     option = Annotated[
-        int | None, typer.Option("--at", metavar="SESSION", help="The world as it was after this session.")
+        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
     ]
     added = inspect.Parameter("at", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
 

@@ -29,12 +29,13 @@ def info(
     loops: Annotated[
         bool,
         typer.Option(
-            "--loops", help="List every loop candidate: scores, verdict and reason; how surely chunks are placed."
+            "--loops",
+            help="List every loop candidate with scores, verdict and reason, and the uncertainty of every chunk.",
         ),
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Say what a memory is: sessions, frames, scale, gravity, instances, loops.
+    """Summarise a memory: sessions, frames, scale, gravity, instances, loops.
 
     Example: list3r info house.l3r --loops
     """
@@ -63,9 +64,14 @@ def list_instances(
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
     min_confidence: Annotated[
         float | None,
-        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, listed or not."),
+        typer.Option(
+            "--min-confidence",
+            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+        ),
     ] = None,
-    at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
+    at: Annotated[
+        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """List the instances with their place and size.
@@ -122,7 +128,7 @@ def show(
     ],
     json: JsonOption = False,
 ) -> None:
-    """Show one instance: where, how big, when seen, its relations, to each other the one that tells most.
+    """Show one instance: where it is, how big, when it was seen, and its most telling relation to each other one.
 
     Example: list3r show house.l3r 12
     """

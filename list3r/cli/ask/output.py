@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 Count = Annotated[int, typer.Option("-k", help="How many at most.")]
 MinConfidence = Annotated[
     float | None,
-    typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+    typer.Option(
+        "--min-confidence",
+        help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+    ),
 ]
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
 Label = Annotated[
@@ -33,20 +36,27 @@ Label = Annotated[
     typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these words."),
 ]
 Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only things of this colour.")]
-MinSize = Annotated[float | None, typer.Option("--min-size", help="Longest edge at least this.")]
-MaxSize = Annotated[float | None, typer.Option("--max-size", help="Longest edge at most this.")]
+MinSize = Annotated[float | None, typer.Option("--min-size", help="Only things whose longest edge is at least this.")]
+MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only things whose longest edge is at most this.")]
 State = Annotated[
     str | None,
     typer.Option(
-        "--state", metavar="present|moved|removed|added|unseen|any", help="Only these; default: all but removed."
+        "--state",
+        metavar="present|moved|removed|added|unseen|any",
+        help="Only things in this state; default: all but removed.",
     ),
 ]
-Component = Annotated[int | None, typer.Option("--component", help="Only this part of a memory in parts.")]
+Component = Annotated[int | None, typer.Option("--component", help="Only this connected component.")]
 View = Annotated[int | None, typer.Option("--view", metavar="FRAME", help="What the camera of this frame sees.")]
-Time = Annotated[float | None, typer.Option("--time", metavar="S", help="The posed frame nearest to this second.")]
+Time = Annotated[
+    float | None,
+    typer.Option("--time", metavar="S", help="The camera of the posed frame nearest to this time, seconds."),
+]
 Pose = Annotated[
     str | None,
-    typer.Option("--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera put here and turned so (OpenCV axes)."),
+    typer.Option(
+        "--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera at this position with this rotation (OpenCV axes)."
+    ),
 ]
 SessionOption = Annotated[int | None, typer.Option("--session", help="The session of the frame or camera.")]
 MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera sees no further than this.")]

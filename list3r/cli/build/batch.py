@@ -29,24 +29,29 @@ class BatchPlace:
 
     engine: Annotated[str, typer.Option("--engine", metavar="local|ray", help="What runs the tasks.")] = "local"
     address: Annotated[
-        str | None, typer.Option("--address", metavar="ADDRESS", help="Of the Ray cluster; default: RAY_ADDRESS.")
+        str | None,
+        typer.Option("--address", metavar="ADDRESS", help="Address of the Ray cluster; default: RAY_ADDRESS."),
     ] = None
-    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Tasks side by side; default: what fits.")] = (
-        None
-    )
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Tasks at the same time; default: as many as fit.")
+    ] = None
     cpus: Annotated[int, typer.Option("--cpus", metavar="N", help="Cores of one task.")] = 1
     task_memory: Annotated[
         float | None, typer.Option("--task-memory", metavar="GIB", help="Memory of one task; default: not counted.")
     ] = None
     gpus: Annotated[float, typer.Option("--gpus", metavar="N", help="GPUs of one task, or a share of one.")] = 0.0
     retries: Annotated[
-        int, typer.Option("--retries", metavar="N", help="Tries again where a process was ended from outside.")
+        int, typer.Option("--retries", metavar="N", help="How often a task is repeated after its process was killed.")
     ] = 3
     scratch: Annotated[
-        Path | None, typer.Option("--scratch", metavar="DIR", help="On each machine's own disk, for what is under way.")
+        Path | None,
+        typer.Option("--scratch", metavar="DIR", help="Folder on each machine's own disk for unfinished memories."),
     ] = None
     state: Annotated[
-        Path | None, typer.Option("--state", metavar="FILE", help="The manifest; default: batch.sqlite in --out.")
+        Path | None,
+        typer.Option(
+            "--state", metavar="FILE", help="File with the state of every task; default: batch.sqlite in --out."
+        ),
     ] = None
 
 
@@ -58,7 +63,8 @@ class BatchTasks:
         int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
     ] = None
     script: Annotated[
-        str | None, typer.Option("--print", metavar="WHAT", help="Print a script instead: slurm, an array job.")
+        str | None,
+        typer.Option("--print", metavar="WHAT", help="Print a script instead of building: slurm, an array job."),
     ] = None
     onto: Annotated[bool, typer.Option("--onto", help="Add videos to memories that no batch made.")] = False
     force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False
@@ -74,7 +80,7 @@ def batch(
     videos: Annotated[
         str,
         typer.Argument(
-            metavar="MANIFEST|FOLDER", help="A file with a video a line, or what holds videos.", show_default=False
+            metavar="MANIFEST|FOLDER", help="A list with one video per line, or a folder of videos.", show_default=False
         ),
     ],
     out: Annotated[str, typer.Option("--out", metavar="DIR", help="Folder or URL of the memories.")],
@@ -86,7 +92,7 @@ def batch(
     run: Annotated[RunOptions, _RUN],
     json: JsonOption = False,
 ) -> None:
-    """Build the memories of many videos, one task a video; given again it does what is not done.
+    """Build the memories of many videos, one task per video. Run again, it does only what is not done yet.
 
     Example: list3r batch walks/ --out memories/
     """
@@ -117,7 +123,7 @@ def batch(
                 groups, make_engine(place.engine, resources, place.jobs, place.address), settings, _told(json)
             )
     except KeyboardInterrupt:
-        note("", "interrupted; what is done stays, give the same command again to go on")
+        note("", "interrupted; finished memories stay; give the same command again to continue")
         raise typer.Exit(1) from None
     _say(report, json)
     if report.failed:

@@ -40,7 +40,7 @@ def inspect(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what a source holds: kind, frames, size, depth, intrinsics, poses, and what is missing.
+    """Say what a source contains: format, frames, size, depth, intrinsics, poses, and what is missing.
 
     Example: list3r inspect walk.mp4 --json
     """
@@ -90,7 +90,8 @@ def build(
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
     asked: BuildOptions,
     debug: Annotated[
-        Path | None, typer.Option("--debug", metavar="DIR", help="Write overlays of masks and tracks there.")
+        Path | None,
+        typer.Option("--debug", metavar="DIR", help="Write pictures of masks, tracks and loops to this folder."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -112,9 +113,9 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the walk, the memory and the exports.")
     ] = Path("list3r-demo"),
-    seed: Annotated[int, typer.Option("--seed", help="Another seed furnishes other rooms.")] = 1,
-    frames: Annotated[int, typer.Option("--frames", help="Length of the walk.")] = 300,
-    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Processes.")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Another seed gives other rooms.")] = 1,
+    frames: Annotated[int, typer.Option("--frames", help="Length of the walk, frames.")] = 300,
+    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Worker processes.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Simulate a walk through two furnished rooms, build its memory, ask it, export it. Nothing is downloaded.

@@ -1,4 +1,4 @@
-"""update: one more video for a memory."""
+"""update: a later video for a memory."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def update(
     asked: BuildOptions,
     json: JsonOption = False,
 ) -> None:
-    """Add one more video to a memory: it is placed against what is stored, and what has changed is written down.
+    """Add a later video to a memory: place it in the same world, and record what has changed.
 
     Example: list3r update house.l3r walk-2/
     """
@@ -38,7 +38,7 @@ def update(
     from list3r.pipeline.update import update as update_memory
 
     def interrupted(begun: bool) -> str:
-        return f"interrupted; {memory} keeps what it knew and the finished chunks: go on with --resume"
+        return f"interrupted; {memory} is unchanged but for the finished chunks; continue with --resume"
 
     def work() -> UpdateReport:
         with watching("updating", interrupted, quiet=json) as watch:
@@ -48,7 +48,7 @@ def update(
 
 
 def report_lines(memory: Path, report: UpdateReport) -> list[str]:
-    """What an update did, for people."""
+    """Return what an update did, for people."""
     events = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in report.events.items())
     lines = [
         f"{memory}  session {report.session}",

@@ -73,11 +73,11 @@ def _option_error(text: str) -> Exception:
 def _check(name: str, words: Words, signature: inspect.Signature) -> None:
     """Raise `OptionError` for what is asked that only a file can tell."""
     if asked_at() is not None:
-        raise _option_error("--at is a question to one file; leave it out, or ask the file")
+        raise _option_error("--at cannot be asked of a catalogue; leave it out, or ask the memory file")
     for word, value in words.items():
         if word not in _TOLD[name] and value != signature.parameters[word].default:
             told = word.replace("_", "-")
-            raise _option_error(f"--{told} is a question to one file; leave it out, or ask the file")
+            raise _option_error(f"--{told} cannot be asked of a catalogue; leave it out, or ask the memory file")
 
 
 def _ask(url: str, name: str, memory: str | None, words: Words, json: bool) -> None:
@@ -100,7 +100,7 @@ def _ask(url: str, name: str, memory: str | None, words: Words, json: bool) -> N
 
 def _one(memory: str | None) -> str:
     if memory is None:
-        raise _option_error(f"a place is one of one memory; name that instead of {ALL}")
+        raise _option_error(f"a place belongs to one memory; name that instead of {ALL}")
     return memory
 
 

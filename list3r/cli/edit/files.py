@@ -69,11 +69,14 @@ def _is_broken(memory: Path, error: Exception) -> bool:
 def repair(
     memory: MemoryArgument,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write the sound file there; default: in its place.")
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="Write the repaired file here; default: in place of the damaged one."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Salvage a damaged memory: keep every sound row, derive the rest anew, say what is lost. The original is kept.
+    """Repair a damaged memory: keep every sound row, derive the rest again, list what is lost. The original is kept.
 
     Example: list3r repair house.l3r
     """

@@ -43,22 +43,22 @@ class CloudWords:
         typer.Option(
             "--align",
             metavar="TRAJECTORY|icp|none",
-            help="Place the estimate by the true path of its camera, by its surfaces, or (give both) by one after the"
-            " other. Absent: by the path where TRUTH is a source, else none.",
+            help="How to align the estimate: by its camera path, by its surfaces (ICP), or, given twice, by one after "
+            "the other. Default: by the path if TRUTH is a source, else none.",
         ),
     ] = None
     path: Annotated[
         Path | None,
-        typer.Option("--path", metavar="TRAJECTORY", help="The estimate's own camera path, where it is no memory."),
+        typer.Option("--path", metavar="TRAJECTORY", help="Camera path of the estimate, if it is not a memory."),
     ] = None
     scale: ScaleOption = "auto"
     threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05
     truncate: Annotated[
-        float | None, typer.Option("--truncate", help="Cap single distances, metres; absent: no cap.")
+        float | None, typer.Option("--truncate", help="Cap each distance at this, metres; default: no cap.")
     ] = None
-    voxel: Annotated[float, typer.Option("--voxel", help="Thin both clouds to one point a cell, metres; 0: not.")] = (
-        0.01
-    )
+    voxel: Annotated[
+        float, typer.Option("--voxel", help="Thin both clouds to one point per cell of this size, metres; 0: keep all.")
+    ] = 0.01
     points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000
     every: EveryOption = None
     plot: PlotOption = None
@@ -155,7 +155,7 @@ def _cloud_alignment(
             said.append(f"{kind} by point-to-plane ICP")
             continue
         if not is_memory(estimate_path) and not estimate_path.suffix.lower() == ".txt":
-            raise OptionError(f"--align {word}: {estimate_path} knows no camera path; give its own with --path")
+            raise OptionError(f"--align {word}: {estimate_path} has no camera path; give one with --path")
         goal = true_path if by_source and true_path is not None else read_trajectory(Path(word))
         S = alignment_of(goal, read_trajectory(estimate_path), with_scale=free)
         said.append(f"{kind} by the camera's path")

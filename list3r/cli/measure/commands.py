@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the program."""
-    group = typer.Typer(help="Measure a result against truth.", no_args_is_help=True, rich_markup_mode=None)
+    group = typer.Typer(help="Compare a result with ground truth.", no_args_is_help=True, rich_markup_mode=None)
     for command in (trajectory, cloud, instances, revisits):
         group.command(command.__name__)(spread(command))
     app.add_typer(group, name="eval")
@@ -56,7 +56,9 @@ class TrajectoryWords:
     scale: Annotated[
         str,
         typer.Option(
-            "--scale", metavar="auto|free|fixed", help="Of the picture; auto: free for a memory of relative scale."
+            "--scale",
+            metavar="auto|free|fixed",
+            help="Alignment in the picture; auto: free for a memory of relative scale.",
         ),
     ] = "auto"
     plot: PlotOption = None
@@ -123,7 +125,7 @@ class InstanceWords:
         typer.Option(
             "--align",
             metavar="TRAJECTORY|none",
-            help="True path of the camera, to place a memory by. Absent: groundtruth.txt beside TRUTH, if it is there.",
+            help="True camera path, by which a memory is aligned. Default: groundtruth.txt beside TRUTH, if present.",
         ),
     ] = None
     scale: ScaleOption = "auto"
@@ -132,10 +134,10 @@ class InstanceWords:
         typer.Option(
             "--ids",
             metavar="FOLDER",
-            help="Pictures of the true ids of every frame, for id switches of a memory. Absent: ids/ beside TRUTH.",
+            help="Folder of pictures of true ids, for id switches of a memory. Default: ids/ beside TRUTH.",
         ),
     ] = None
-    every: Annotated[int, typer.Option("--every", metavar="N", help="Follow ids over every N-th frame.")] = 1
+    every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1
     plot: PlotOption = None
 
 
@@ -150,7 +152,7 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceWords, json: Json
 
     align = asked.align
     if align not in (None, "none") and estimate.is_file() and not is_memory(estimate):
-        raise OptionError(f"--align {align} places a memory; {estimate} is none and knows no camera path")
+        raise OptionError(f"--align {align} aligns a memory; {estimate} is not one and has no camera path")
     check_scale(asked.scale)
     check_plot(asked.plot)
     check_every(asked.every)
@@ -190,7 +192,7 @@ def _identities(
 
     folder = ids or truth.parent / "ids"
     if ids is not None and not ids.is_dir():
-        raise OptionError(f"--ids {ids} is no folder; give the folder with one picture of true ids a frame")
+        raise OptionError(f"--ids {ids} is not a folder; give the folder with one picture of true ids per frame")
     if not is_memory(estimate):
         if ids is not None:
             raise OptionError(f"--ids: {estimate} has no masks; id switches are measured on a memory")

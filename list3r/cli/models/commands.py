@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 models = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="List the networks that can be used, with their licences and cached weights, and fetch weights.",
+    help="List the networks with their licences and cached weights, and download weights.",
 )
 
 
@@ -38,7 +38,7 @@ def list_models(
     ] = "any",
     json: JsonOption = False,
 ) -> None:
-    """Say of every model what it does, under which licences, whether its package and its weights are here.
+    """List every model: what it does, its licences, and whether its package and weights are on this machine.
 
     Example: list3r models list --licence permissive
     """
@@ -77,7 +77,7 @@ def fetch_model(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Bring the weights of a model into the cache, so that it runs without a network from then on.
+    """Download the weights of a model into the cache; from then on it runs offline.
 
     Example: list3r models fetch mapanything --licence permissive
     """
@@ -103,10 +103,10 @@ def precompute(
     request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
     words: src.SourceWords,
     run: Annotated[RunOptions, only("licence")],
-    force: Annotated[bool, typer.Option("--force", help="Write chunks anew that are there already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write chunks again that are there already.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Reconstruct a video into .npz files, which `build --reconstruction precomputed --weights DIR` reads elsewhere.
+    """Reconstruct a video into .npz files, for `build --reconstruction precomputed --weights DIR` on another machine.
 
     Example: list3r precompute walk.mp4 --out walk-pi3/ --reconstruction pi3
     """

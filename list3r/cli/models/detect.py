@@ -25,7 +25,9 @@ def detect(
     memory: MemoryArgument,
     detector: Annotated[
         Path,
-        typer.Option("--detector", metavar="FILE", help="A NanoDet detector for ncnn: .param, its .bin beside."),
+        typer.Option(
+            "--detector", metavar="FILE", help="A NanoDet detector for ncnn (.param, with its .bin beside it)."
+        ),
     ],
     *,
     run: Annotated[RunOptions, only("detector_classes")],
@@ -41,14 +43,14 @@ def detect(
     words: src.SourceWords,
     json: JsonOption = False,
 ) -> None:
-    """Name the things of a memory: boxes of a detector vote over many frames. What an operator named keeps its name.
+    """Name the things of a memory by a box detector, whose boxes vote over many frames. Names by an operator stay.
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
     from list3r.memory.errors import OptionError
 
     if source is None and words != src.SourceWords():
-        raise OptionError("options that say how a video is read, such as --every, need the video: --source SOURCE")
+        raise OptionError("options of a video, such as --every, need the video: --source SOURCE")
     from list3r.pipeline.finishing import load_detector, name_things
 
     network, options = load_detector(detector, run.detector_classes), words.options()
