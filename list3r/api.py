@@ -405,9 +405,7 @@ class SceneMemory(MemoryEdits):
 
         posed = position is not None and quat_wxyz is not None
         if (frame is not None) + (time_s is not None) + posed != 1 or (position is None) != (quat_wxyz is None):
-            raise OptionError(
-                "name a camera by its frame, by a time, or by a position with a quaternion: one of the three"
-            )
+            raise OptionError("give one of frame, time, or position with quaternion to name a camera")
         if frame is not None:
             return camera_of_frame(self.store, frame, session)
         if time_s is not None:

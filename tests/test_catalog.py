@@ -158,7 +158,7 @@ def test_stored_relations_answer_by_words_and_ids(catalog: Catalog) -> None:
     assert {(r.subject % 3, r.object % 3) for r in found} == {(0, 1)}
     with pytest.raises(OptionError, match="not one that is stored"):
         catalog.relations("random", predicate="left_of")
-    with pytest.raises(OptionError, match="number in one memory"):
+    with pytest.raises(OptionError, match="belongs to one memory"):
         catalog.relations(subject=3)
 
 
@@ -390,12 +390,12 @@ def test_a_catalogue_written_anew_answers_the_same(room: Path, tmp_path: Path) -
 
 
 def test_files_that_are_no_catalogue_are_refused(tmp_path: Path, room: Path) -> None:
-    with pytest.raises(CatalogError, match="is no catalogue"):
+    with pytest.raises(CatalogError, match="is not a catalogue"):
         Catalog.open(str(room))
     (tmp_path / "text").write_text("no database at all, but long enough to be taken for the head of one" * 20)
     with pytest.raises(CatalogError, match="cannot be opened"):
         Catalog.open(str(tmp_path / "text"))
-    with pytest.raises(CatalogError, match="mysql:// is no catalogue"):
+    with pytest.raises(CatalogError, match="mysql:// is not a catalogue"):
         Catalog.open("mysql://here/a")
 
 

@@ -156,9 +156,9 @@ def test_older_boxes_and_names_of_spark_dsg_are_read(tmp_path: Path) -> None:
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n",
             "ends",
         ),
-        ("cloud.ply", b"PLY", "no PLY"),
+        ("cloud.ply", b"PLY", "not a PLY"),
         ("dsg.json", b'{"nodes": [], "layer_ids": []}', "holds no things"),
-        ("other.json", b'{"a": 1}', "no map of"),
+        ("other.json", b'{"a": 1}', "not a map of"),
     ],
 )
 def test_what_is_no_map_is_refused_and_leaves_nothing(name: str, data: bytes, why: str, tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def test_it_is_the_default_and_damage_to_its_weights_is_said(tmp_path: Path, mon
 def test_a_session_of_a_discoverer_that_is_gone_says_how_to_go_on() -> None:
     depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
     begun = BuildSettings(discovery="geometric")
-    with pytest.raises(OptionError, match="go on with --discovery learned"):
+    with pytest.raises(OptionError, match="continue with --discovery learned"):
         settings_resumed(BuildRequest(), begun, depth, "any")
     assert settings_resumed(BuildRequest(discovery="learned"), begun, depth, "any")[0].discovery == "learned"
 

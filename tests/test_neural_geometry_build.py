@@ -113,7 +113,7 @@ def test_geometry_written_in_one_place_is_built_in_another(
     with list3r.open(tmp_path / "m.l3r") as scene:
         assert len(scene.store.chunks.all()) == 2, "cut as the files are"
     assert run([*out[:-4], "--chunk", "6", "--overlap", "3"]) == 2
-    assert "holds files of another model or other chunks" in capsys.readouterr().err
+    assert "holds files of another model or of other chunks" in capsys.readouterr().err
 
 
 def test_errors_are_one_line(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

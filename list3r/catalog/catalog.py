@@ -89,7 +89,7 @@ class Catalog:
             output.prepare()
             if output.size(kept) is None:
                 if is_remote(str(path)):
-                    raise CatalogError(f"{path} lies in a store already; catalogue it where it is, without --store")
+                    raise CatalogError(f"{path} is in a store already; add it from there, without --store")
                 output.publish(Path(path), kept, replace=False)
             content = read_content(output.place(kept), content.entry.name)
         return self._backend.put(content)
@@ -132,7 +132,7 @@ class Catalog:
         """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
         k, filters = _count(k), filters or CatalogFilters()
         if (point is None) == (instance_id is None):
-            raise OptionError("give a point or an instance to be near to, one of the two")
+            raise OptionError("give a point or an instance, one of the two")
         at = checked_point(point, "point") if point is not None else self._known(memory, instance_id).box.center
         count, own = k + 8, instance_id
         while True:
@@ -215,7 +215,7 @@ class Catalog:
         chosen = self._space(memory, space)
         if instance_id is not None:
             if memory is None:
-                raise OptionError("an instance has its number in one memory; name that")
+                raise OptionError("the number of an instance belongs to one memory; name that memory")
             self._known(memory, instance_id)
             asked = self._backend.vector(memory, instance_id, chosen)
             if asked is None:
@@ -246,7 +246,7 @@ class Catalog:
             stored = ", ".join(p for p in ALL_PREDICATES if p not in VIEWPOINT and p != "between")
             raise OptionError(f"predicate {predicate!r} is not one that is stored; choose one of: {stored}")
         if subject is None and object is None and memory is None:
-            raise OptionError("over all memories a subject or an object is needed: words, such as mug")
+            raise OptionError("a question to all memories needs words for the subject or the object, such as mug")
         ends = self._end(subject, memory), self._end(object, memory)
         rows = self._backend.related(memory, ends[0], predicate, ends[1], k)
         by_name = self._by_name(entries, [r[0] for r in rows])
@@ -281,7 +281,7 @@ class Catalog:
         if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):
             return Wanted(tuple(wanted_words(what)))
         if memory is None:
-            raise OptionError(f"{what} has its number in one memory; name that, or give words")
+            raise OptionError(f"the number of {what} belongs to one memory; name that memory, or give words")
         number = int(what.removeprefix("#")) if isinstance(what, str) else what
         return Wanted(instance_id=self._known(memory, number).id)
 

@@ -19,14 +19,14 @@ def read_content(path: str, name: str | None = None) -> MemoryContent:
     Raises `MemoryFileError` for what is no memory, `CatalogError` for one that is being written.
     """
     if path != printable(path):
-        raise CatalogError(f"{printable(path)} is no text in UTF-8, as a catalogue keeps it; rename the file or folder")
+        raise CatalogError(f"{printable(path)} is not valid UTF-8, which a catalogue needs; rename the file or folder")
     if is_remote(path):
         with tempfile.TemporaryDirectory() as folder:
             local = fetched(path, Path(folder) / "memory")
             return _content(local, path, 0, name)
     local = Path(path).resolve()
     if not local.is_file():
-        raise CatalogError(f"{path} is no file; name a memory, such as house.l3r")
+        raise CatalogError(f"{path} is not a file; name a memory, such as house.l3r")
     return _content(local, str(local), local.stat().st_mtime_ns, name)
 
 

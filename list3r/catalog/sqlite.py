@@ -62,7 +62,7 @@ class SqliteBackend:
             self._database = sqlite3.connect(path, timeout=30.0, isolation_level=None, check_same_thread=False)
             known = self._database.execute("PRAGMA application_id").fetchone()[0]
             if known not in (0, _APPLICATION_ID) or (known == 0 and self._tables()):
-                raise CatalogError(f"{path} is no catalogue; name another file")
+                raise CatalogError(f"{path} is not a catalogue; name another file")
             if known == 0:
                 self._database.execute("PRAGMA journal_mode = WAL")
                 self._database.executescript(
@@ -273,7 +273,9 @@ class SqliteBackend:
             while some := rows.fetchmany(_BATCH):
                 held = np.frombuffer(b"".join(v for _, v in some), "<f2").reshape(len(some), -1).astype(np.float32)
                 if held.shape[1] != len(unit):
-                    raise CatalogError(f"a vector of {len(unit)} numbers is none of {space}, which has {held.shape[1]}")
+                    raise CatalogError(
+                        f"a vector of {len(unit)} numbers does not belong to {space}, which has {held.shape[1]}"
+                    )
                 both = np.column_stack([held @ unit, [n for n, _ in some]])
                 best = np.concatenate([best, both])
                 best = best[np.lexsort((best[:, 1], -best[:, 0]))[:k]]
@@ -303,7 +305,7 @@ class SqliteBackend:
                 yield
         except sqlite3.Error as error:
             raise CatalogError(
-                f"{self._path} cannot be read: {error}; `list3r catalog rebuild` makes it anew"
+                f"{self._path} cannot be read: {error}; `list3r catalog rebuild` makes a new one"
             ) from error
 
     @contextlib.contextmanager

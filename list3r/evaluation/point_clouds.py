@@ -49,7 +49,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     path = Path(path)
     ending = path.suffix.lower()
     if not path.is_file():
-        raise SourceError(f"{path} does not exist or is no file; give a cloud ({', '.join(ENDINGS)}) or a memory")
+        raise SourceError(f"{path} does not exist or is not a file; give a cloud ({', '.join(ENDINGS)}) or a memory")
     if ending not in ENDINGS:
         raise SourceError(f"{path} ends in {ending or 'nothing'}; give a cloud ({', '.join(ENDINGS)}) or a memory")
     try:

@@ -213,7 +213,7 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
     """
     words = _file_text(text)
     if words is None and _names_a_file(text):
-        raise OptionError(f"{name} {text!r}: there is no such file, and it is no row of numbers such as tx,ty,tz")
+        raise OptionError(f"{name} {text!r}: there is no such file, and it is not a row of numbers such as tx,ty,tz")
     v = np.array(parse_numbers(words or text, name))
     matrix = np.eye(4)
     if len(v) in (12, 16):

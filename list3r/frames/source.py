@@ -98,7 +98,7 @@ def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
     """Open several video files as one. Raises `SourceError` for anything else."""
     for path in paths:
         if not path.is_file() or path.suffix.lower() in (*IMAGE_ENDINGS, *FILES):
-            raise SourceError(f"{path} is no video file; only video files of one recording can be given together")
+            raise SourceError(f"{path} is not a video file; only video files of one recording can be given together")
         if not os.access(path, os.R_OK) or path.stat().st_size == 0:
             raise SourceError(f"{path} is empty or may not be read; check the copy and its permissions")
     from list3r.frames.readers.joined import JoinedVideos

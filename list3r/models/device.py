@@ -53,7 +53,9 @@ def memory_said(what: str) -> Iterator[None]:
     except Exception as error:
         if "torch" not in sys.modules or not is_out_of_memory(error):
             raise
-        raise OptionError(f"{what} does not fit into the memory; free it, use another model, or --device cpu") from None
+        raise OptionError(
+            f"{what} does not fit into the GPU memory; free some, use another model, or --device cpu"
+        ) from None
 
 
 def pictures_that_fit(free_mb: float, figures: MemoryFigures, pixels: int) -> int:

@@ -99,7 +99,7 @@ def _from_file(cls: Any, file: Path) -> tuple[Any, set[str]]:
     if isinstance(state, dict) and isinstance(state.get("model"), dict):
         state = state["model"]
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise OptionError(f"{file} is no state dict of a network")
+        raise OptionError(f"{file} is not a state dict of a network")
     model = cls()
     model.load_state_dict(state, strict=False)
     return model, set(state)

@@ -115,7 +115,7 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
     manifest = Manifest("metric" if metric else "relative", named, chunks.length, chunks.overlap)
     make_folder(out)
     if (out / MANIFEST).exists() and not force and read_manifest(out) != manifest:
-        raise OptionError(f"{out} holds files of another model or other chunks; give another --out, or --force")
+        raise OptionError(f"{out} holds files of another model or of other chunks; give another --out, or --force")
     write_manifest(out, manifest)
 
 

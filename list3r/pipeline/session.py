@@ -342,11 +342,11 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"--poses {settings.poses} is not known; choose estimate, prior, given or auto")
     model, every = entry(settings.reconstruction), settings.depth_every
     if every is not None and not 1 <= every <= MOST_DEPTH_EVERY:
-        raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; --every takes fewer frames at all")
+        raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; to take fewer frames use --every")
     if every is not None and every > 1 and not model.thins:
         raise OptionError(
-            f"--depth-every is of models that compute depth from colour (sfm), not of {settings.reconstruction}; leave "
-            "it out, or thin the frames with --every"
+            f"--depth-every belongs to models that compute depth from colour (sfm), not to {settings.reconstruction}; "
+            "leave it out, or thin the frames with --every"
         )
     if model.needs_depth and not info.has_depth:
         raise OptionError(
@@ -382,7 +382,7 @@ def _check_prior(info: SourceInfo, reconstruction: str) -> None:
             f"{otherwise}"
         )
     if not entry(reconstruction).follows_prior:
-        raise OptionError(f"--poses prior is of --reconstruction rgbd, not of {reconstruction}; {otherwise}")
+        raise OptionError(f"--poses prior needs --reconstruction rgbd, not {reconstruction}; {otherwise}")
 
 
 def check_convention(source: FrameSource) -> None:

@@ -137,7 +137,7 @@ def check(edges: Sequence[Edge]) -> None:
         finite[stated] &= np.isfinite(np.array([edges[k].covariance for k in stated])).all(axis=(1, 2))
     if not finite.all():
         e = edges[int(np.argmin(finite))]
-        raise DegenerateError(f"the edge between chunks {e.u} and {e.v} ({e.kind}) holds a number not finite")
+        raise DegenerateError(f"the edge between chunks {e.u} and {e.v} ({e.kind}) has a value that is not finite")
 
 
 def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array:

@@ -152,7 +152,7 @@ def seen(
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
         if camera is None and options.max_depth is not None:
-            raise OptionError("--max-depth is how far a camera sees; leave it out where an instance is named")
+            raise OptionError("--max-depth belongs to a camera; leave it out for an instance")
         if camera is not None:
             found = scene.visible(camera, max_depth=options.max_depth, structure=structure)
             if camera.frame is not None and not json:

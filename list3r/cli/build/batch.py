@@ -110,7 +110,7 @@ def batch(
     )
     if tasks.script is not None:
         if tasks.script != "slurm":
-            raise OptionError(f"--print {tasks.script} is not known; slurm is")
+            raise OptionError(f"--print {tasks.script} is not known; give slurm")
         write(slurm_script(_without_print(sys.argv[1:]), len(groups), resources, place.jobs))
         return
     try:

@@ -79,7 +79,7 @@ def _check_overlay(overlay: Path, source: Path) -> None:
         raise OptionError(f"--overlay {overlay}: the picture must end in .png")
     check_target(overlay)
     if overlay.exists() and overlay.resolve().is_relative_to(source.resolve()):
-        raise OptionError(f"--overlay {overlay} is a picture of the source; name another file")
+        raise OptionError(f"--overlay {overlay} is a picture of the source itself; name another file")
 
 
 @spread

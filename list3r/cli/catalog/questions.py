@@ -53,7 +53,7 @@ def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
         url, everywhere = words.pop("catalog", None), words.pop("everywhere", False)
         if url is None:
             if everywhere:
-                raise _option_error("--everywhere goes with --catalog URL")
+                raise _option_error("--everywhere needs --catalog URL")
             return command(**words)
         json, memory = words.pop("json"), str(words.pop("memory"))
         _check(name, words, signature)
@@ -107,7 +107,7 @@ def _one(memory: str | None) -> str:
 def _nearest(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
     point, near, told = words["point"], words["id"], words["words"]
     if told is not None and (point is not None or near is not None):
-        raise _option_error("words and a place together are a question to one file; leave one of them out")
+        raise _option_error("a catalogue takes words or a place, not both; leave one out")
     if told is not None:
         return catalog.find(told, memory, k=words["k"], filters=filters)
     at = None if point is None else parse_point(point, "--point")
@@ -143,12 +143,14 @@ def _picture(catalog: Catalog, memory: str | None, words: Words) -> tuple[Any, s
     entries = catalog.memories() if memory is None else [catalog.memory(memory)]
     path = next((e.path for e in entries if Path(e.path).is_file()), None)
     if path is None:
-        raise _option_error("no file of the catalogue lies on this machine, which names the model of the picture")
+        raise _option_error(
+            "no memory file of the catalogue is on this machine to say which model describes the picture"
+        )
     like = LikeWords(words["id"], words["image"], words["box"])
     with open_scene(path) as scene:
         asked = picture_query(scene.store, words["image"], like.corners())
     if asked.part is not None:
-        raise _option_error("pictures are compared by vectors of a model; `list3r embed` makes those of the memories")
+        raise _option_error("the memories have no vectors to compare pictures with; `list3r embed` makes them")
     return asked.vector, asked.space
 
 

@@ -98,7 +98,7 @@ def export(
     options = words.given()
     if out == Path("-"):
         if json:
-            raise OptionError("--out - takes standard output, --json too; leave one of them out")
+            raise OptionError("--out - and --json both write to standard output; leave one out")
         with open_memory(memory, min_confidence) as scene:
             _pipe(scene, to, options)
         return
@@ -130,7 +130,7 @@ def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
 
     form = find_format(to)
     if form.folder:
-        raise OptionError(f"{to} is a folder and cannot be piped; name one with --out")
+        raise OptionError(f"{to} is a folder and cannot go to standard output; name a folder with --out")
     with tempfile.TemporaryDirectory() as folder:
         first, *others = scene.export(to, Path(folder) / f"{scene.path.stem}{form.suffixes[0]}", **options)
         with first.open("rb") as file:

@@ -177,4 +177,4 @@ def _check_lengths(**lengths: float | None) -> None:
 
     for name, value in lengths.items():
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise OptionError(f"--{name} {value:g}: a length above 0 in metres is needed")
+            raise OptionError(f"--{name} {value:g}: give a length above 0, metres")

@@ -76,7 +76,7 @@ def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryWords, json: J
     check_scale(asked.scale)
     check_plot(asked.plot)
     if not tolerance >= 0:
-        raise OptionError(f"--tolerance {tolerance:g}: seconds, 0 or more, are needed")
+        raise OptionError(f"--tolerance {tolerance:g}: give 0 or more seconds")
     apart = Delta.parse(asked.delta)
     true, found = read_trajectory(truth), read_trajectory(estimate)
     errors = evaluate_trajectory(true, found, tolerance, delta=apart)

@@ -176,7 +176,7 @@ def _named(name: str, licence: str) -> Weights:
 
     parts = split_name(name)
     if parts is None:
-        raise OptionError(f"{name} is no repository; its name is owner/name or owner/name@revision")
+        raise OptionError(f"{name} is not the name of a repository; give owner/name or owner/name@revision")
     for card in CARDS:
         if (known := find_weights(card, parts[0])) is not None:
             choose_weights(card, name, licence, "model")

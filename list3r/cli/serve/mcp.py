@@ -47,9 +47,9 @@ def mcp(
     from list3r.memory.errors import OptionError
 
     if (memory is None) == (catalog is None):
-        raise OptionError("mcp serves one of two: a memory, or --catalog URL; list3r mcp house.l3r")
+        raise OptionError("give a memory or --catalog URL, one of the two: list3r mcp house.l3r")
     if catalog is not None and write:
-        raise OptionError("--write edits one memory; a catalogue is only asked")
+        raise OptionError("--write needs a memory; a catalogue cannot be edited")
     from list3r.server.app import HttpSettings, serve_http, serve_stdio
 
     with _opened(memory, catalog, write=write) as served:

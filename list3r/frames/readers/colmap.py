@@ -94,11 +94,11 @@ def _read(model: Path) -> tuple[Any, dict[str, NDArray[np.float64]]]:
         said = str(error).splitlines()[0]
         if "optional" in said:
             said = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
-        raise SourceError(f"{model} is no model of COLMAP that can be read ({said})") from None
+        raise SourceError(f"{model} is not a model of COLMAP that can be read ({said})") from None
     poses = {name: pose_matrix(rows.ravel().tolist()) for name, rows in stated.items()}
     wrong = [name for name, T in poses.items() if T is None]
     if wrong:
-        raise SourceError(f"{model}: the pose of {wrong[0]} is no rigid motion; copy the model again")
+        raise SourceError(f"{model}: the pose of {wrong[0]} is not a rigid motion; copy the model again")
     for name, size in written_sizes(found).items():
         if (model / name).is_file() and (model / name).stat().st_size != size:
             raise SourceError(apart)

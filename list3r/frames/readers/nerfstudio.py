@@ -85,7 +85,7 @@ def _metric(content: Mapping[str, Any], files: Sequence[FrameFile]) -> bool:
 def _units_per_metre(path: Path, content: Mapping[str, Any]) -> float:
     unit_m = content.get("depth_unit_scale_factor", 0.001)
     if not isinstance(unit_m, int | float) or not unit_m > 0:
-        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is no positive number of metres; mend it")
+        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is not a positive number of metres; mend it")
     return 1.0 / unit_m
 
 

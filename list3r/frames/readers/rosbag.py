@@ -328,7 +328,7 @@ class _Topics:
         if role in self._wanted:
             topic = self._wanted[role]
             if topic not in self._streams:
-                raise OptionError(f"--topics {role}={topic} is no topic of pictures")
+                raise OptionError(f"--topics {role}={topic} is not a topic of pictures")
             return self._streams[topic]
         for word in (*likely, ""):
             fitting = [s for s in found if word in s.topic]

@@ -50,7 +50,7 @@ def find_file(path: Path, options: SourceOptions) -> FolderLayout:
         (version,) = struct.unpack("<I", _exactly(file, 4, path))
         (length,) = struct.unpack("<Q", _exactly(file, 8, path))
         if version != _VERSION or length > _LONGEST_NAME:
-            raise SourceError(f"{path} is no .sens file of version 4; unpack the scene with ScanNet's reader")
+            raise SourceError(f"{path} is not a .sens file of version 4; unpack the scene with ScanNet's reader")
         _exactly(file, length, path)
         color_k, color_e, depth_k, depth_e = (_matrix(file, path) for _ in range(4))
         codec, depth_codec, width, height, depth_width, depth_height, units, count = _SIZES.unpack(
@@ -112,7 +112,7 @@ def _intrinsics(matrix: NDArray[np.float64]) -> Intrinsics:
 def _matrix_file(path: Path) -> Intrinsics:
     rows = read_numbers(path) if path.is_file() else []
     if len(rows) < 2 or min(len(rows[0]), len(rows[1])) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
-        raise SourceError(f"{path} is no camera matrix; mend it, or give --intrinsics and --depth-intrinsics")
+        raise SourceError(f"{path} is not a camera matrix; mend it, or give --intrinsics and --depth-intrinsics")
     return rows[0][0], rows[1][1], rows[0][2], rows[1][2]
 
 

@@ -169,7 +169,7 @@ def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
     before = _owners(store, [a, b])
     one = len(before) == 1 and len(before[0][2]) > 0 and {a, b} <= set(before[0][2])
     if one != (d.kind == "merge"):
-        raise OptionError(f"entry {entry} does not hold any more: {d.a} and {d.b} are {'one' if one else 'two'} now")
+        raise OptionError(f"entry {entry} no longer applies: {d.a} and {d.b} are {'one' if one else 'two'} now")
     edit = replace(_edit("split" if one else "merge", ((a,), (b,)), before, author), target=entry)
     reason = f"{edit.author} took back the {d.kind} of entry {entry}"
     return _carry_out(store, edit, (d.a, d.b), reason)
@@ -287,7 +287,7 @@ def _check_effect(edit: Edit, home: Mapping[Key, int]) -> None:
     if edit.kind in ("merge", "split"):
         left, right = ({home[k] for k in part if k in home} for part in edit.parts)
         if left and right and (left == right) != (edit.kind == "merge"):
-            raise OptionError(f"the {edit.kind} does not come about: what was seen moving says otherwise")
+            raise OptionError(f"the {edit.kind} has no effect: what was seen moving contradicts it")
 
 
 def _retired(
@@ -310,5 +310,5 @@ def _checked_part(instance_id: int, keys: Sequence[Key], out: Sequence[Key]) -> 
         known = f"`list3r show MEMORY {instance_id} --json` lists them"
         raise OptionError(f"{key_name(wrong[0])} is not a part of #{instance_id}; {known}")
     if not out or set(out) == set(keys):
-        raise OptionError(f"a part of #{instance_id} must leave and a part must stay; it has {len(keys)} in all")
+        raise OptionError(f"a part of #{instance_id} must leave and a part must stay; it has {len(keys)} parts")
     return tuple(sorted(set(out)))

@@ -78,7 +78,7 @@ def _camera(path: Path) -> tuple[list[float] | None, NDArray[np.float64] | None]
         return None, None
     content = read_json(path)
     if not isinstance(content, dict):
-        raise SourceError(f"{path} is no camera of Polycam; mend or remove it")
+        raise SourceError(f"{path} is not a camera of Polycam; mend or remove it")
     try:
         stated = [float(content[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")]
         T_world_arkit = pose_matrix(float(content[f"t_{row}{column}"]) for row in range(3) for column in range(4))

@@ -130,7 +130,7 @@ def _layout(
     where: Path, content: object, present: set[str], stored: Callable[[str], Stored], options: SourceOptions
 ) -> FolderLayout:
     if not isinstance(content, dict):
-        raise SourceError(f"{where}: its metadata is no table; export it from Record3D again")
+        raise SourceError(f"{where}: its metadata is not a table; export it from Record3D again")
     named = (_PICTURE.fullmatch(name) for name in present)
     numbers = sorted(int(found[1]) for found in named if found)
     if not numbers:
