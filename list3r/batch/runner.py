@@ -44,7 +44,7 @@ class BatchSettings:
             raise OptionError(f"--retries {self.retries}: give 0 or more")
         if self.state is None and is_remote(self.out):
             raise OptionError(
-                f"--out {self.out} is not a folder of this machine; say where the manifest is: --state FILE"
+                f"--out {self.out} is not a folder of this machine; say where the state file goes: --state FILE"
             )
 
     def ledger(self) -> Path:
