@@ -45,21 +45,21 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     parser.add_argument("--strangers", action="store_true", help="add sessions to memories of other homes in --keep")
-    words = parser.parse_args()
-    first, last = (int(n) for n in words.seeds.split("-"))
-    if words.strangers:
-        write_json(words.json, strangers(words.keep, range(first, last + 1)))
+    args = parser.parse_args()
+    first, last = (int(n) for n in args.seeds.split("-"))
+    if args.strangers:
+        write_json(args.json, strangers(args.keep, range(first, last + 1)))
         return
-    rows = json.loads(words.json.read_text())["homes"] if words.json and words.json.exists() else []
+    rows = json.loads(args.json.read_text())["homes"] if args.json and args.json.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(first, last + 1):
             if any(row["seed"] == seed for row in rows):
                 continue
             rows.append(
-                {"seed": seed, "commit": STARTED_AT, **one_home((words.keep or Path(scratch)) / str(seed), seed)}
+                {"seed": seed, "commit": STARTED_AT, **one_home((args.keep or Path(scratch)) / str(seed), seed)}
             )
             print(json.dumps(rows[-1]), flush=True)
-            write_json(words.json, {"homes": rows, "total": total(rows)})
+            write_json(args.json, {"homes": rows, "total": total(rows)})
     print(machine())
     print(json.dumps(total(rows), indent=1))
 

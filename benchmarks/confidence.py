@@ -53,11 +53,11 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, required=True, help="folder of walks and memories; what is there is kept")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for kind in KINDS:
-        for seed in seeds_of(getattr(words, kind)) if getattr(words, kind) else []:
-            walk = words.keep / f"{kind}-{seed}"
+        for seed in seeds_of(getattr(args, kind)) if getattr(args, kind) else []:
+            walk = args.keep / f"{kind}-{seed}"
             found = judged(built(walk, kind, seed), walk, kind)
             rows.append({"kind": kind, "seed": seed, **found})
             print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
@@ -65,9 +65,9 @@ def main() -> None:
     print(machine())
     for kind, entry in table.items():
         print(kind, json.dumps(entry))
-    if words.fit:
+    if args.fit:
         print(fitted(rows))
-    write_json(words.json, {"mean": table, "walks": rows})
+    write_json(args.json, {"mean": table, "walks": rows})
 
 
 def built(walk: Path, kind: str, seed: int) -> Path:

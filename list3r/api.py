@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from list3r.frames.options import SourceOptions
     from list3r.memory.geometry import Sim3
     from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
-    from list3r.pipeline.request import BuildRequest, RunWords
+    from list3r.pipeline.request import BuildRequest, RunArguments
     from list3r.pipeline.settings import BuildSettings
     from list3r.queries.changes import Changed
     from list3r.queries.find import Found
@@ -98,7 +98,7 @@ def build(
     *,
     options: SourceOptions | None = None,
     settings: BuildSettings | BuildRequest | None = None,
-    **run: Unpack[RunWords],
+    **run: Unpack[RunArguments],
 ) -> SceneMemory:
     """Build the memory of a video or folder and open it; of a webcam or stream until it ends.
 
@@ -126,7 +126,7 @@ def update(
     *,
     options: SourceOptions | None = None,
     settings: BuildSettings | BuildRequest | None = None,
-    **run: Unpack[RunWords],
+    **run: Unpack[RunArguments],
 ) -> SceneMemory:
     """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
 
@@ -358,9 +358,9 @@ class SceneMemory(MemoryEdits):
 
     def word_encoder(self) -> WordEncoder | None:
         """What compares free words, where the memory was embedded by a text and image model."""
-        from list3r.semantics.embedding import stored_words
+        from list3r.semantics.embedding import stored_text_model
 
-        return stored_words(self.store)
+        return stored_text_model(self.store)
 
     @_alone
     def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:

@@ -9,7 +9,7 @@ import pytest
 
 from list3r.association.revisits.constellations.constellation import Constellation
 from list3r.association.revisits.constellations.matching import MatchingSettings, likeness, match_constellations
-from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, belief, doubt
+from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, log_odds, refusal
 from list3r.association.revisits.constellations.surface_fit import (
     ChunkSurfaces,
     Held,
@@ -139,7 +139,7 @@ def test_a_relation_is_believed_by_all_that_speaks_for_it() -> None:
     }
     settings = ConstellationRegistrationSettings()
     # -3.1 + 0.89 * 3 + 0.33 * 8 - 2.6 * 1 + 9.7 * 0 + 1 * 0 + 9.3 * 0.7
-    assert belief(scores, settings.belief) == pytest.approx(6.12)
-    assert doubt(scores, settings) is None
+    assert log_odds(scores, settings.belief) == pytest.approx(6.12)
+    assert refusal(scores, settings) is None
     for worse in ({"agreeing": 3.0}, {"agreement": 0.6}, {"after": 2.5}, {"fitting": 0.09}, {"rival": 0.95}):
-        assert doubt(scores | worse, settings) is not None
+        assert refusal(scores | worse, settings) is not None

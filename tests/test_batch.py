@@ -22,7 +22,7 @@ from list3r.batch.storage import Output, fetched, listing
 from list3r.batch.tasks import Asked, BatchTask, read_tasks
 from list3r.batch.work import BatchJob, Outcome, run_task
 from list3r.cli.app import run as list3r
-from list3r.cli.build.source_options import SourceWords
+from list3r.cli.build.source_options import SourceArguments
 from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
@@ -31,7 +31,7 @@ from list3r.pipeline.workers import TaskPool, WorkerError
 from list3r.pipeline.workers.ray_pool import RayPool
 from list3r.simulation.dataset import WalkSettings, write_walk
 
-ASKED = Asked(lambda fields: replace(SourceWords(), **fields).options())
+ASKED = Asked(lambda fields: replace(SourceArguments(), **fields).options())
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 @contextmanager
-def memory_said(what: str) -> Iterator[None]:
+def out_of_memory_reported(what: str) -> Iterator[None]:
     """Turn memory that runs out into an `OptionError` that says for what it was needed."""
     try:
         yield

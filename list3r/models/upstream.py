@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from list3r.memory.errors import OptionError
 from list3r.models.cache import SINGLE_FILES, check_weights
 from list3r.models.cards import ModelCard
-from list3r.models.device import memory_said
+from list3r.models.device import out_of_memory_reported
 
 if TYPE_CHECKING:
     import torch
@@ -63,7 +63,7 @@ def load_upstream(cls: Any, path: Path, device: torch.device) -> Any:
     except Exception as error:  # what torch, safetensors and the class raise on foreign weights is not a closed list
         raise OptionError(f"{path} cannot be loaded as {cls.__name__}: {first_line(error)}") from None
     _check_complete(model, names, path)
-    with memory_said(f"the network {path}"):
+    with out_of_memory_reported(f"the network {path}"):
         return model.to(device).eval()
 
 

@@ -163,7 +163,7 @@ class RunOptions:
     )
 
 
-class RunWords(TypedDict, total=False):
+class RunArguments(TypedDict, total=False):
     """The fields of `RunOptions` as arguments of Python."""
 
     licence: str

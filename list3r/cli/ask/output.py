@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from list3r.api import SceneMemory
-    from list3r.cli.ask.words import CameraWords
+    from list3r.cli.ask.arguments import CameraArguments
     from list3r.memory.records import BestView, Relation
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
@@ -33,7 +33,7 @@ MinConfidence = Annotated[
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
 Label = Annotated[
     str | None,
-    typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these words."),
+    typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these given."),
 ]
 Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only things of this colour.")]
 MinSize = Annotated[float | None, typer.Option("--min-size", help="Only things whose longest edge is at least this.")]
@@ -62,11 +62,11 @@ SessionOption = Annotated[int | None, typer.Option("--session", help="The sessio
 MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera sees no further than this.")]
 
 
-def camera_from(scene: SceneMemory, words: CameraWords) -> PosedCamera | None:
+def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | None:
     """The camera that the options name; None for none of them. Raises `OptionError`."""
     from list3r.memory.errors import OptionError
 
-    view, time, pose, session = words.view, words.time, words.pose, words.session
+    view, time, pose, session = given.view, given.time, given.pose, given.session
     if sum(option is not None for option in (view, time, pose)) > 1:
         raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
     if view is None and time is None and pose is None:

@@ -8,9 +8,17 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.ask.arguments import (
+    OF_LOOKS,
+    CameraArguments,
+    FilterArguments,
+    NearArguments,
+    RegionArguments,
+    RelationArguments,
+    SimilarArguments,
+)
 from list3r.cli.ask.changes import changes
 from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
-from list3r.cli.ask.words import OF_LOOKS, CameraWords, FilterWords, LikeWords, NearWords, RegionWords, RelationWords
 from list3r.cli.catalog.questions import with_catalog
 from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memory, print_table, spread, with_at
 from list3r.cli.terminal import say
@@ -31,7 +39,7 @@ def register(app: typer.Typer) -> None:
 
 
 def nearest(
-    memory: MemoryArgument, near: NearWords, *, k: Count = 5, filters: FilterWords, json: JsonOption = False
+    memory: MemoryArgument, near: NearArguments, *, k: Count = 5, filters: FilterArguments, json: JsonOption = False
 ) -> None:
     """The things nearest to a point or an instance, with distances of surfaces and of centres.
 
@@ -56,11 +64,11 @@ def nearest(
 
 def within(
     memory: MemoryArgument,
-    region: RegionWords,
-    camera: Annotated[CameraWords, only("view", "pose", "session", "max_depth")],
+    region: RegionArguments,
+    camera: Annotated[CameraArguments, only("view", "pose", "session", "max_depth")],
     *,
     occlusion: Annotated[bool, typer.Option(help="Leave out what other things hide from the camera.")] = True,
-    filters: Annotated[FilterWords, only(*OF_LOOKS)],
+    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
     json: JsonOption = False,
 ) -> None:
     """The things inside a box or a sphere, or those that a camera sees.
@@ -76,7 +84,7 @@ def within(
         print_matches(found, scene.units, json, total=len(found))
 
 
-def relations(memory: MemoryArgument, asked: RelationWords, json: JsonOption = False) -> None:
+def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False) -> None:
     """The relations between things, by subject, predicate and object.
 
     Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
@@ -87,10 +95,10 @@ def relations(memory: MemoryArgument, asked: RelationWords, json: JsonOption = F
 
 def similar(
     memory: MemoryArgument,
-    like: LikeWords,
+    like: SimilarArguments,
     *,
     k: Count = 5,
-    filters: Annotated[FilterWords, only(*OF_LOOKS)],
+    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
     json: JsonOption = False,
 ) -> None:
     """The things that look most like one instance, or like a picture.
@@ -136,7 +144,7 @@ def find(
 
 def seen(
     memory: MemoryArgument,
-    options: CameraWords,
+    options: CameraArguments,
     instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
     structure: Structure = False,
     json: JsonOption = False,

@@ -88,7 +88,7 @@ def batch(
     place: BatchPlace,
     tasks: BatchTasks,
     request: BuildRequest,
-    words: src.SourceWords,
+    given: src.SourceArguments,
     run: Annotated[RunOptions, _RUN],
     json: JsonOption = False,
 ) -> None:
@@ -96,7 +96,7 @@ def batch(
 
     Example: list3r batch walks/ --out memories/
     """
-    groups = _read(videos, words, request, run)
+    groups = _read(videos, given, request, run)
     from list3r.batch.engines.base import TaskResources, make_engine  # after a list that may be refused
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
@@ -130,11 +130,11 @@ def batch(
         raise typer.Exit(1)
 
 
-def _read(videos: str, words: src.SourceWords, request: BuildRequest, run: RunOptions) -> list[list[BatchTask]]:
+def _read(videos: str, given: src.SourceArguments, request: BuildRequest, run: RunOptions) -> list[list[BatchTask]]:
     """Return the videos of each memory, before what builds them is loaded."""
     from list3r.batch.tasks import Asked, read_tasks
 
-    return read_tasks(videos, Asked(lambda fields: replace(words, **fields).options(), request, run))
+    return read_tasks(videos, Asked(lambda fields: replace(given, **fields).options(), request, run))
 
 
 def _told(quiet: bool) -> Any:

@@ -31,7 +31,7 @@ def inspect(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
-    words: src.SourceWords,
+    given: src.SourceArguments,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the colour camera and the depth-to-colour transform.")
     ] = False,
@@ -49,7 +49,7 @@ def inspect(
     from list3r.frames.pose_agreement import scale_doubts
     from list3r.frames.source import open_source
 
-    options = words.options(more)
+    options = given.options(more)
     if overlay is not None:
         _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
@@ -99,7 +99,7 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    options = asked.words.options(more)
+    options = asked.given.options(more)
     from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:

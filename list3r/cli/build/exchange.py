@@ -25,7 +25,7 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True)
-class PredictionWords:
+class PredictionArguments:
     """Options that describe the predictions of a network."""
 
     frame_size: Annotated[
@@ -55,8 +55,8 @@ def convert(
             help="tum, transforms, colmap, replica or r3d; for predictions of networks: precomputed.",
         ),
     ],
-    predictions: PredictionWords,
-    words: src.SourceWords,
+    predictions: PredictionArguments,
+    given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
     """Write the frames of any source in a layout that other programs read.
@@ -67,12 +67,12 @@ def convert(
         from list3r.reconstruction.outputs.base import OutputOptions
 
         size = predictions.frame_size
-        options = OutputOptions(words.every, None if size is None else read_size(size), predictions.masks)
+        options = OutputOptions(given.every, None if size is None else read_size(size), predictions.masks)
         _convert_predictions(Path(source), folder, options, json)
         return
     from list3r.frames.convert import convert as write
 
-    report = write(source, to, folder, words.options())
+    report = write(source, to, folder, given.options())
     if json:
         print_answer([report.as_dict()])
         return

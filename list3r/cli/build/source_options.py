@@ -95,7 +95,7 @@ MaxSide = Annotated[
 
 
 @dataclass(frozen=True)
-class SourceWords:
+class SourceArguments:
     """The options above as they were given."""
 
     kind: Kind = "auto"
@@ -117,20 +117,20 @@ class SourceWords:
 
     def options(self, more: list[str] | None = None) -> SourceOptions:
         """Return what they mean, with further files of the recording. Raises `OptionError` naming the option."""
-        from list3r.frames import options as words
+        from list3r.frames import options as parsing
 
-        first, stop = words.parse_range(self.frames) if self.frames else (None, None)
+        first, stop = parsing.parse_range(self.frames) if self.frames else (None, None)
         color, depth, transform = self.intrinsics, self.depth_intrinsics, self.depth_to_color
-        return words.SourceOptions(
+        return parsing.SourceOptions(
             kind=self.kind,
             every=self.every,
             start=first,
             stop=stop,
-            intrinsics=words.parse_intrinsics(color, "--intrinsics") if color else None,
-            distortion=words.parse_distortion(self.distortion) if self.distortion else None,
-            depth_intrinsics=words.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
-            T_color_depth=words.parse_transform(transform, "--depth-to-color") if transform else None,
-            topics=words.parse_topics(self.topics) if self.topics else None,
+            intrinsics=parsing.parse_intrinsics(color, "--intrinsics") if color else None,
+            distortion=parsing.parse_distortion(self.distortion) if self.distortion else None,
+            depth_intrinsics=parsing.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
+            T_color_depth=parsing.parse_transform(transform, "--depth-to-color") if transform else None,
+            topics=parsing.parse_topics(self.topics) if self.topics else None,
             episode=self.episode,
             registered=self.registered,
             depth_scale=self.depth_scale,

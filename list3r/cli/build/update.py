@@ -34,7 +34,7 @@ def update(
 
     Example: list3r update house.l3r walk-2/
     """
-    options = asked.words.options(more)
+    options = asked.given.options(more)
     from list3r.pipeline.update import update as update_memory
 
     def interrupted(begun: bool) -> str:

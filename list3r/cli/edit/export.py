@@ -35,7 +35,7 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True)
-class ExportWords:
+class ExportArguments:
     """Options of some formats. What is left out takes the default of the format."""
 
     color: str | None = field(default=None, metadata=option("ply, glb: rgb (as seen) or instance.", "rgb|instance"))
@@ -78,7 +78,7 @@ def export(
         Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for standard output.")
     ],
     *,
-    words: ExportWords,
+    words: ExportArguments,
     min_confidence: Annotated[
         float | None,
         typer.Option(

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CloudWords:
+class CloudArguments:
     """How clouds are placed, thinned and compared."""
 
     align: Annotated[
@@ -64,7 +64,7 @@ class CloudWords:
     plot: PlotOption = None
 
 
-def cloud(truth: Truth, estimate: Estimate, asked: CloudWords, json: JsonOption = False) -> None:
+def cloud(truth: Truth, estimate: Estimate, asked: CloudArguments, json: JsonOption = False) -> None:
     """Accuracy, completeness, Chamfer, normal consistency, F-score. TRUTH: a cloud or mesh, a memory, or a source with
     depth and poses; ESTIMATE: a cloud or a memory (all supports of its things and surfaces, in the world).
 
@@ -94,12 +94,12 @@ def cloud(truth: Truth, estimate: Estimate, asked: CloudWords, json: JsonOption 
         gaps = (distances.to_truth, distances.to_estimate)
         save_picture(_figure(found, true, gaps, 2 * asked.threshold, title, true_path), asked.plot)
     if json:
-        used = {"truth": true.words, "estimate": found.words, "alignment": how, "voxel_m": asked.voxel}
+        used = {"truth": true.text, "estimate": found.text, "alignment": how, "voxel_m": asked.voxel}
         counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
         print_answer([{**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)}])
         return
-    say(f"truth     {true.words}; {len(true.points):,} compared")
-    say(f"estimate  {found.words}; {len(found.points):,} compared")
+    say(f"truth     {true.text}; {len(true.points):,} compared")
+    say(f"estimate  {found.text}; {len(found.points):,} compared")
     say(f"aligned   {how}")
     _print_errors(errors)
 
@@ -132,7 +132,7 @@ def _figure(
 
 
 def _cloud_alignment(
-    asked: CloudWords, truth: tuple[PointCloud, Trajectory | None, Path], estimate: tuple[PointCloud, Path]
+    asked: CloudArguments, truth: tuple[PointCloud, Trajectory | None, Path], estimate: tuple[PointCloud, Path]
 ) -> tuple[Sim3, str]:
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register

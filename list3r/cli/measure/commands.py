@@ -46,7 +46,7 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True)
-class TrajectoryWords:
+class TrajectoryArguments:
     """How poses are associated and placed."""
 
     delta: Annotated[
@@ -64,7 +64,7 @@ class TrajectoryWords:
     plot: PlotOption = None
 
 
-def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryWords, json: JsonOption = False) -> None:
+def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryArguments, json: JsonOption = False) -> None:
     """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a TUM file, a memory, or a source with poses.
 
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
@@ -109,15 +109,15 @@ def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float
     S_truth_estimate = align(a, b, with_scale=free)
     errors = position_errors(a, b, S_truth_estimate)
     kind = f"Sim(3), scale {float(S_truth_estimate.scale):.4f}" if free else "SE(3)"
-    words = f"{title}\nATE {float((errors**2).mean() ** 0.5):.4f} m RMSE over {len(errors)} poses, {kind}"
-    return trajectory_figure(truth, b.time_s, S_truth_estimate.apply(b.positions()), errors, words)
+    title_text = f"{title}\nATE {float((errors**2).mean() ** 0.5):.4f} m RMSE over {len(errors)} poses, {kind}"
+    return trajectory_figure(truth, b.time_s, S_truth_estimate.apply(b.positions()), errors, title_text)
 
 
 # ---------------------------------------------------------------------------------------------- instances
 
 
 @dataclass(frozen=True)
-class InstanceWords:
+class InstanceArguments:
     """How a scene is placed, and where true ids lie."""
 
     align: Annotated[
@@ -141,7 +141,7 @@ class InstanceWords:
     plot: PlotOption = None
 
 
-def instances(truth: Truth, estimate: Estimate, asked: InstanceWords, json: JsonOption = False) -> None:
+def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: JsonOption = False) -> None:
     """Recall, precision, duplicates, merges, id switches; relations. TRUTH: a truth.json; ESTIMATE: a memory or scene
     JSON.
 
@@ -216,8 +216,8 @@ def _instances_figure(
     true_boxes = {k: (box, labels[k]) for k, box in scene_boxes(true).items() if k in counted}
     boxes = {k: (box, "") for k, box in scene_boxes(found, S_truth_scene).items()}
     loose = scores["instances_0.25"]
-    words = f"{title}: recall {loose['recall']:.2f}, precision {loose['precision']:.2f} at IoU 0.25"
-    return instances_figure(true_boxes, boxes, matches, words)
+    title_text = f"{title}: recall {loose['recall']:.2f}, precision {loose['precision']:.2f} at IoU 0.25"
+    return instances_figure(true_boxes, boxes, matches, title_text)
 
 
 def score_rows(scores: dict[str, Any]) -> list[list[object]]:

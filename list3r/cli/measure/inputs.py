@@ -199,8 +199,8 @@ def _fused(path: Path, every: int | None) -> tuple[PointCloud, Trajectory]:
         cloud = PointCloud(local @ T[:3, :3].T + T[:3, 3], None)
         parts.append(thinned(cloud, 0.01).points if len(local) else cloud.points)
     points = np.concatenate(parts)
-    words = f"{len(points):,} points of the depth of {len(parts)} frames"
-    return PointCloud(points, None, words), Trajectory(frames.time_s, frames.T_source_cam)
+    text = f"{len(points):,} points of the depth of {len(parts)} frames"
+    return PointCloud(points, None, text), Trajectory(frames.time_s, frames.T_source_cam)
 
 
 def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
@@ -219,8 +219,8 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
     if not len(points):
         raise OptionError(f"{path} holds no surface point; finish its build with --resume")
     surfaces = sum(i.structure is not None for i in main.instances)
-    words = f"{len(points):,} points of {len(supports) - surfaces} things and {surfaces} surfaces"
-    return PointCloud(points, None, words), _stored(path)
+    text = f"{len(points):,} points of {len(supports) - surfaces} things and {surfaces} surfaces"
+    return PointCloud(points, None, text), _stored(path)
 
 
 # ---------------------------------------------------------------------------------------------- scenes

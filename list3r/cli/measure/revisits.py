@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RevisitWords:
+class RevisitArguments:
     """How loops are judged."""
 
     least: Annotated[
@@ -55,7 +55,7 @@ class RevisitWords:
 def revisits(
     truth: Truth,
     memory: Annotated[Path, typer.Argument(metavar="MEMORY", show_default=False)],
-    asked: RevisitWords,
+    asked: RevisitArguments,
     json: JsonOption = False,
 ) -> None:
     """Precision and recall of loops against covisibility. TRUTH: the source with depth and poses, or an .npz of frame

@@ -101,7 +101,7 @@ def precompute(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
     *,
     request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
-    words: src.SourceWords,
+    given: src.SourceArguments,
     run: Annotated[RunOptions, only("licence")],
     force: Annotated[bool, typer.Option("--force", help="Write chunks again that are there already.")] = False,
     json: JsonOption = False,
@@ -110,7 +110,7 @@ def precompute(
 
     Example: list3r precompute walk.mp4 --out walk-pi3/ --reconstruction pi3
     """
-    options = words.options()
+    options = given.options()
     from list3r.pipeline.precompute import precompute as write
 
     def interrupted(begun: bool) -> str:

@@ -40,7 +40,7 @@ def detect(
             show_default=False,
         ),
     ] = None,
-    words: src.SourceWords,
+    given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
     """Name the things of a memory by a box detector, whose boxes vote over many frames. Names by an operator stay.
@@ -49,11 +49,11 @@ def detect(
     """
     from list3r.memory.errors import OptionError
 
-    if source is None and words != src.SourceWords():
+    if source is None and given != src.SourceArguments():
         raise OptionError("options of a video, such as --every, need the video: --source SOURCE")
     from list3r.pipeline.finishing import load_detector, name_things
 
-    network, options = load_detector(detector, run.detector_classes), words.options()
+    network, options = load_detector(detector, run.detector_classes), given.options()
     with progress_bar("detecting", "chunks", quiet=json) as bar:
         report = name_things(memory, network, source, options, bar.show)
     if json:

@@ -28,7 +28,7 @@ from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
-from list3r.models.device import memory_said
+from list3r.models.device import out_of_memory_reported
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
@@ -216,7 +216,7 @@ def _described(
     """What is found in a reconstruction, and what is kept of it."""
     s = task.settings
     named, tracker = _instance_models(s)
-    with memory_said("what finds and follows things"):
+    with out_of_memory_reported("what finds and follows things"):
         library = build_library(frames, reconstruction, s.instances, discoverer or named, tracker)
     clock.mark("instances")
     keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, _detector(s), library)

@@ -34,7 +34,7 @@ OF_LOOKS = ("label", "color", "min_size", "max_size", "min_confidence", "structu
 
 
 @dataclass(frozen=True)
-class FilterWords:
+class FilterArguments:
     """Which things may answer."""
 
     label: Label = None
@@ -61,7 +61,7 @@ class FilterWords:
 
 
 @dataclass(frozen=True)
-class NearWords:
+class NearArguments:
     """What to be near to."""
 
     words: Annotated[str | None, typer.Argument(metavar="[WORDS]", help="Only things that these words name.")] = None
@@ -81,7 +81,7 @@ class NearWords:
 
 
 @dataclass(frozen=True)
-class CameraWords:
+class CameraArguments:
     """A camera: that of a frame, or one put somewhere."""
 
     time: Time = None
@@ -92,7 +92,7 @@ class CameraWords:
 
 
 @dataclass(frozen=True)
-class RegionWords:
+class RegionArguments:
     """A box, or a sphere."""
 
     box: Annotated[
@@ -101,7 +101,7 @@ class RegionWords:
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Centre of a sphere.")] = None
     radius: Annotated[float | None, typer.Option("--radius", help="Radius of the sphere.")] = None
 
-    def lengths(self, camera: CameraWords) -> dict[str, Sequence[float] | float]:
+    def lengths(self, camera: CameraArguments) -> dict[str, Sequence[float] | float]:
         """Return the region, nothing for that of a camera. Raises `OptionError` unless there is one of them."""
         from list3r.memory.errors import OptionError
 
@@ -124,7 +124,7 @@ class RegionWords:
 
 
 @dataclass(frozen=True)
-class RelationWords:
+class RelationArguments:
     """Which relations, and who looks."""
 
     subject: Annotated[
@@ -161,7 +161,7 @@ class RelationWords:
 
 
 @dataclass(frozen=True)
-class LikeWords:
+class SimilarArguments:
     """What things are compared with."""
 
     id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Compare with this instance.")] = None
