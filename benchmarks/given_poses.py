@@ -54,22 +54,22 @@ def main() -> None:
     parser.add_argument("--blind", action="store_true", help="with a bare wall, quick turns and a second of dark")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
-    args = parser.parse_args()
+    words = parser.parse_args()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        for seed in map(int, args.seeds.split(",")):
-            folder = (args.keep or Path(scratch)) / f"seed-{seed}"
+        for seed in map(int, words.seeds.split(",")):
+            folder = (words.keep or Path(scratch)) / f"seed-{seed}"
             if not (folder / "truth.json").exists():
-                walk = WalkSettings(seed=seed, frames=args.frames, path=PACE)
-                blind = BlindSettings() if args.blind else None
-                write_phone_walk(folder, walk, LidarSettings(unsure_times=args.unsure), blind=blind)
-            for mode in args.modes.split(","):
+                walk = WalkSettings(seed=seed, frames=words.frames, path=PACE)
+                blind = BlindSettings() if words.blind else None
+                write_phone_walk(folder, walk, LidarSettings(unsure_times=words.unsure), blind=blind)
+            for mode in words.modes.split(","):
                 rows.append({"seed": seed, "poses": mode, **measured(folder, mode)})
                 print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-    mean = {mode: average([r for r in rows if r["poses"] == mode]) for mode in args.modes.split(",")}
+    mean = {mode: average([r for r in rows if r["poses"] == mode]) for mode in words.modes.split(",")}
     print(machine())
     print(json.dumps(mean, indent=1))
-    write_json(args.json, {"mean": mean, "rows": rows})
+    write_json(words.json, {"mean": mean, "rows": rows})
 
 
 def measured(folder: Path, mode: str) -> dict[str, Any]:
