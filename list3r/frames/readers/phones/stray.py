@@ -50,7 +50,7 @@ def open_recording(root: Path, options: SourceOptions) -> VideoWithDepth:
 def _matrix(path: Path) -> Intrinsics:
     rows = read_numbers(path) if path.is_file() else []
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
-        raise SourceError(f"{path} is not a 3x3 camera matrix; mend it, or give --intrinsics fx,fy,cx,cy")
+        raise SourceError(f"{path} is no 3x3 camera matrix; mend it, or give --intrinsics fx,fy,cx,cy")
     try:
         return check_intrinsics([rows[0][0], rows[1][1], rows[0][2], rows[1][2]])
     except OptionError as error:
