@@ -12,7 +12,7 @@ from list3r.association.revisits.constellations.matching import MatchingSettings
 from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, log_odds, refusal
 from list3r.association.revisits.constellations.surface_fit import (
     ChunkSurfaces,
-    Held,
+    KnownRelation,
     SurfaceFitSettings,
     fit_surfaces,
 )
@@ -120,7 +120,7 @@ def test_surfaces_bring_a_rough_relation_together_and_up_holds_it_upright() -> N
     rough = S_v_u @ Sim3.exp(np.array([0.08, -0.06, 0.05, 0.02, -0.02, 0.05, 0.04]))
     things = np.array([[1.0, 1.0, 0.5], [3.0, 1.0, 0.5], [2.0, 2.5, 1.0]])
     up = np.array([0.0, 0.0, 1.0])
-    found = fit_surfaces(rough, u, v, Held(things, S_v_u.apply(things), up, up, 1.5), metric=False)
+    found = fit_surfaces(rough, u, v, KnownRelation(things, S_v_u.apply(things), up, up, 1.5), metric=False)
     assert found is not None
     error = np.abs((found.S_v_u.inverse() @ S_v_u).log())
     assert error[:3].max() < 0.02 and np.degrees(error[3:6].max()) < 0.5 and error[6] < 0.01

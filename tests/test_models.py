@@ -396,7 +396,7 @@ def test_unknown_names_list_the_known_ones() -> None:
 def test_memory_that_runs_out_is_said_in_one_line() -> None:
     from list3r.models.device import out_of_memory_reported
 
-    with pytest.raises(OptionError, match=r"^the tracker does not fit into the memory; .*--device cpu$"):
+    with pytest.raises(OptionError, match=r"^the tracker does not fit into the GPU memory; .*--device cpu$"):
         with out_of_memory_reported("the tracker"):
             raise torch.OutOfMemoryError("CUDA out of memory")
     with pytest.raises(ValueError, match="other"), out_of_memory_reported("the tracker"):
