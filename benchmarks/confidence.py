@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import calibration
 from colour import EVERY, LEAST_PX, SIZE, colour_only, compare_masks, memory_masks, true_masks
 from discovery import MIN_PX, seeds_of
 from discovery_memory import film_of, write_film
@@ -27,7 +28,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import list3r
-from list3r.evaluation.calibration import calibration
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import read_scene
 from list3r.memory.library.evidence import EvidenceSettings

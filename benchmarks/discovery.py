@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import calibration
 from machine import machine, write_json
 from numpy.typing import NDArray
 
-from list3r.evaluation.calibration import calibration
 from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.instances.base import Discoverer, Proposals
 from list3r.instances.geometric.support import thin, without_fliers

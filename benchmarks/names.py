@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import calibration
 from discovery import seeds_of
 from machine import machine, write_json
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from list3r.evaluation.calibration import calibration
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CutSettings, join_parts
 from list3r.instances.learned.discovery import LearnedSettings

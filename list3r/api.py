@@ -215,13 +215,6 @@ class SceneMemory(MemoryEdits):
         return self.store.instances.all(structure=structure)
 
     @_alone
-    def instances_at(self, session_id: int) -> list[Instance]:
-        """Return all instances, structure too, as they were after a session. Raises `OptionError`."""
-        from list3r.memory.maintenance.history import world_at
-
-        return world_at(self.store, session_id)
-
-    @_alone
     def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> list[Changed]:
         """Return what was moved, removed and added in the sessions after `since`, the newest session first."""
         from list3r.queries.changes import changes

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r.evaluation.calibration import calibration
+from benchmarks.calibration import calibration
 from list3r.instances.geometric.support import without_fliers
 from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs, with_confidence
 from list3r.memory.library.labels import (

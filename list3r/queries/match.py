@@ -78,7 +78,7 @@ class Filters:
     state: str | None = None
     """present, moved, removed, added, unseen, or any; None for all but removed."""
     label: str | None = None
-    """Words that must all be in the label or the description."""
+    """Words that must all be in the label, the description or the kind of structure."""
     color: str | None = None
     """A colour; "red" includes dark red."""
     min_size: float | None = None
