@@ -62,18 +62,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--profile", action="store_true", help="where the time of the largest memory went")
     parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
+    words = parser.parse_args()
     found: dict[str, list[dict[str, Any]]] = {}
     print(machine())
-    for name in args.walks.split(","):
-        sizes = [int(n) for n in args.chunks.split(",") if name != "stay" or int(n) <= args.stay_chunks]
-        found[name] = measure(name, sizes, args)
+    for name in words.walks.split(","):
+        sizes = [int(n) for n in words.chunks.split(",") if name != "stay" or int(n) <= words.stay_chunks]
+        found[name] = measure(name, sizes, words)
         for row in found[name]:
             print(f"{name}  " + "  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
-        write_json(args.json, {"walks": found})
+        write_json(words.json, {"walks": found})
 
 
-def measure(name: str, sizes: list[int], args: argparse.Namespace) -> list[dict[str, Any]]:
+def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict[str, Any]]:
     """Medians of chunks added to memories of several sizes, turn by turn, so that all of them meet the same machine."""
     watched = cProfile.Profile()
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as stack:
@@ -85,32 +85,32 @@ def measure(name: str, sizes: list[int], args: argparse.Namespace) -> list[dict[
             path = Path(scratch) / f"{n}.l3r"
             stores[n] = stack.enter_context(Store.create(path))
             before = resident_mb()
-            begin(stores[n], n + args.repeat)
+            begin(stores[n], n + words.repeat)
             for k in range(n):
-                add(stores[n], chunk(k, name, args.seed))
+                add(stores[n], chunk(k, name, words.seed))
             resident[n], peak[n] = round(resident_mb() - before, 1), peak_mb()
             size_mb[n] = round(path.stat().st_size / 1e6, 1)
-            if args.sessions > 1:
+            if words.sessions > 1:
                 end(stores[n], 1)
-                begin(stores[n], args.repeat)
+                begin(stores[n], words.repeat)
         rows: dict[int, list[dict[str, float]]] = {n: [] for n in sizes}
-        for turn in range(args.repeat):
+        for turn in range(words.repeat):
             for n in sizes:
-                result = chunk(n + turn, name, args.seed) if args.sessions == 1 else again(n, turn, name, args.seed)
-                if args.profile and n == sizes[-1]:
+                result = chunk(n + turn, name, words.seed) if words.sessions == 1 else again(n, turn, name, words.seed)
+                if words.profile and n == sizes[-1]:
                     watched.enable()
-                rows[n].append(add(stores[n], result, args.sessions))
+                rows[n].append(add(stores[n], result, words.sessions))
                 watched.disable()
-        if args.profile:
+        if words.profile:
             pstats.Stats(watched).sort_stats("cumtime").print_stats(60)
         out = []
         for n in sizes:
             row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instances.count())}
             for key in ("placing_s", "library_s", "all_s"):
                 row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
-            row["end_s"] = end(stores[n], args.sessions)
+            row["end_s"] = end(stores[n], words.sessions)
             row["edit_s"], row["undo_s"] = edited(stores[n])
-            if args.sessions == 1:
+            if words.sessions == 1:
                 row["finish_s"], row["finish_peak_mb"] = finished(stores[n])
             row["written"] = int(np.median([r["written"] for r in rows[n]]))
             out.append({**row, "memory_mb": resident[n], "peak_mb": peak[n], "file_mb": size_mb[n]})

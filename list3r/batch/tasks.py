@@ -119,7 +119,7 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
         options = asked.options_of(fields)
     except TypeError:
         raise OptionError(
-            f"{at}: one of {', '.join(fields)} is not an option of a source; see `list3r build -h`"
+            f"{at}: one of {', '.join(fields)} is no option of a source; see `list3r build -h`"
         ) from None
     except List3rError as error:
         raise OptionError(f"{at}: {error}") from error

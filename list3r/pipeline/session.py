@@ -345,8 +345,8 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; to take fewer frames use --every")
     if every is not None and every > 1 and not model.thins:
         raise OptionError(
-            f"--depth-every belongs to models that compute depth from colour (sfm), not to {settings.reconstruction}; "
-            "leave it out, or thin the frames with --every"
+            f"--depth-every is of models that compute depth from colour (sfm), not of {settings.reconstruction}; leave "
+            "it out, or thin the frames with --every"
         )
     if model.needs_depth and not info.has_depth:
         raise OptionError(
