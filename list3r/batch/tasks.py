@@ -118,9 +118,7 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
     try:
         options = asked.options_of(fields)
     except TypeError:
-        raise OptionError(
-            f"{at}: one of {', '.join(fields)} is no option of a source; see `list3r build -h`"
-        ) from None
+        raise OptionError(f"{at}: one of {', '.join(fields)} is no option of a source; see `list3r build -h`") from None
     except List3rError as error:
         raise OptionError(f"{at}: {error}") from error
     settings = [asdict(options), asdict(asked.request), _shaping(asked.run)]
