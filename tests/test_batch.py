@@ -211,7 +211,7 @@ def test_one_batch_at_a_time_holds_the_manifest(tmp_path: Path) -> None:
     with Ledger(path), pytest.raises(MemoryFileError, match="being written by this process"):
         Ledger(path)
     path.write_bytes(b"something else that is long enough to be read as a file of SQLite" * 20)
-    with pytest.raises(MemoryFileError, match="no manifest of a batch"):
+    with pytest.raises(MemoryFileError, match="not the state file of a batch"):
         Ledger(path)
 
 

@@ -197,7 +197,7 @@ MORE_CASES = {
     "demo of one frame": ("demo --out {p}/demo --frames 1", "--frames 1: at least 2"),
     "demo of a negative seed": ("demo --out {p}/demo --seed -1", "--seed -1: at least 0"),
     "demo without workers": ("demo --out {p}/demo --workers 0", "--workers 0: at least 1"),
-    "precompute onto a file": ("precompute {p}/good --out {p}/note.txt", "note.txt cannot be made.*another"),
+    "precompute onto a file": ("precompute {p}/good --out {p}/note.txt", "note.txt cannot be created.*another"),
     "precompute of broken pictures": ("precompute {p}/corrupt --out {p}/broken", "5 of 6 frames cannot be used"),
     "embed of nothing": ("embed {p}/nothing.l3r", "does not exist"),
     "more sure than sure": ("list {p}/room.l3r --min-confidence 7", "--min-confidence 7"),
