@@ -17,13 +17,6 @@ if TYPE_CHECKING:
     from list3r.memory.records import DetectedLabel, Instance, Relation
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("info")(info)
-    app.command("list")(list_instances)
-    app.command("show")(show)
-
-
 def info(
     memory: MemoryArgument,
     loops: Annotated[

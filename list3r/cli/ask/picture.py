@@ -12,11 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("picture")(picture)
-
-
 def picture(
     memory: MemoryArgument,
     instance_id: Annotated[

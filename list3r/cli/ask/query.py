@@ -24,20 +24,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memor
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(
-        help="Ask what is near, inside, visible, similar, related, described by words, or changed.",
-        no_args_is_help=True,
-        rich_markup_mode=None,
-    )
-    for command in (nearest, within, relations, similar, find):
-        group.command(command.__name__)(with_at(with_catalog(spread(command))))
-    for other in (seen, path, changes):
-        group.command(other.__name__)(with_at(spread(other)))
-    app.add_typer(group, name="query")
-
-
 def nearest(
     memory: MemoryArgument, near: NearArguments, *, k: Count = 5, filters: FilterArguments, json: JsonOption = False
 ) -> None:
@@ -210,3 +196,14 @@ def path(
     with open_memory(memory) as scene:
         found = scene.path_between(start, end, structure=structure)
         print_relations(scene, found, json)
+
+
+questions = typer.Typer(
+    help="Ask what is near, inside, visible, similar, related, described by words, or changed.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+for command in (nearest, within, relations, similar, find):
+    questions.command(command.__name__)(with_at(with_catalog(spread(command))))
+for other in (seen, path, changes):
+    questions.command(other.__name__)(with_at(spread(other)))

@@ -70,11 +70,6 @@ class BatchTasks:
     force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("batch")(batch)
-
-
 @spread
 def batch(
     videos: Annotated[

@@ -19,13 +19,6 @@ if TYPE_CHECKING:
     from list3r.pipeline.reports import BuildReport
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("inspect")(inspect)
-    app.command("build")(build)
-    app.command("demo")(demo)
-
-
 @spread
 def inspect(
     source: src.SourceArgument,

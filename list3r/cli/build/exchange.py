@@ -18,12 +18,6 @@ if TYPE_CHECKING:
     from list3r.reconstruction.outputs.base import OutputOptions
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("convert")(convert)
-    app.command("import")(import_map)
-
-
 @dataclass(frozen=True)
 class PredictionArguments:
     """Options that describe the predictions of a network."""

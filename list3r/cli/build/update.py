@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from list3r.cli.build import source_options as src
 from list3r.cli.build.build_options import BuildOptions
 from list3r.cli.build.progress import say_result, watching
@@ -14,11 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, spread
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import UpdateReport
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("update")(update)
 
 
 @spread

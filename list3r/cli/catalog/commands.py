@@ -31,16 +31,6 @@ Files = Annotated[list[str], typer.Argument(metavar="FILE...", help="Memory file
 _DEFAULT = "catalog.sqlite"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(
-        help="Keep many memories in one catalogue, and ask them together.", no_args_is_help=True, rich_markup_mode=None
-    )
-    for name, command in (("add", add), ("remove", remove), ("list", list_), ("check", check), ("rebuild", rebuild)):
-        group.command(name)(command)
-    app.add_typer(group, name="catalog")
-
-
 def add(
     files: Files,
     catalog: CatalogOption = _DEFAULT,
@@ -169,3 +159,10 @@ def _memories(files: Sequence[str]) -> Iterator[str]:
         if not found:
             raise OptionError(f"{file} holds no memory (*.l3r)")
         yield from found
+
+
+catalogue = typer.Typer(
+    help="Keep many memories in one catalogue, and ask them together.", no_args_is_help=True, rich_markup_mode=None
+)
+for name, command in (("add", add), ("remove", remove), ("list", list_), ("check", check), ("rebuild", rebuild)):
+    catalogue.command(name)(command)

@@ -22,16 +22,6 @@ IdArgument = Annotated[
 AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Author of the edit; default: you.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("merges")(merges)
-    app.command("undo")(undo)
-    app.command("merge")(merge)
-    app.command("split")(split)
-    app.command("label")(label)
-    app.command("delete")(delete)
-
-
 def merges(
     memory: MemoryArgument,
     instance_id: Annotated[

@@ -29,11 +29,6 @@ _FORMAT_OPTION = typer.Option(
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("export")(export)
-
-
 @dataclass(frozen=True)
 class ExportArguments:
     """Options of some formats. What is left out takes the default of the format."""

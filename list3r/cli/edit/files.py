@@ -12,13 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_tab
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("verify")(verify)
-    app.command("repair")(repair)
-    app.command("doctor")(doctor)
-
-
 def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
     """Check every page, checksum and reference of a memory; status 1 when damage is found.
 

@@ -12,11 +12,6 @@ from list3r.cli.edit.commands import AuthorOption
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("scale")(scale)
-
-
 def scale(
     memory: MemoryArgument,
     anchor: Annotated[

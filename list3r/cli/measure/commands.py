@@ -34,14 +34,6 @@ if TYPE_CHECKING:
     from list3r.memory.geometry import Sim3
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(help="Compare a result with ground truth.", no_args_is_help=True, rich_markup_mode=None)
-    for command in (trajectory, cloud, instances, revisits):
-        group.command(command.__name__)(spread(command))
-    app.add_typer(group, name="eval")
-
-
 # ---------------------------------------------------------------------------------------------- trajectory
 
 
@@ -230,3 +222,8 @@ def score_rows(scores: dict[str, Any]) -> list[list[object]]:
     for name, entry in scores["relations"]["by_predicate"].items():
         rows.append([f"{name}, of matched things", share(entry["recall"]), share(entry["precision"]), ""])
     return rows
+
+
+measures = typer.Typer(help="Compare a result with ground truth.", no_args_is_help=True, rich_markup_mode=None)
+for command in (trajectory, cloud, instances, revisits):
+    measures.command(command.__name__)(spread(command))

@@ -25,12 +25,6 @@ models = typer.Typer(
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.add_typer(models, name="models")
-    app.command("precompute")(precompute)
-
-
 @models.command("list")
 def list_models(
     licence: Annotated[

@@ -15,11 +15,6 @@ from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("detect")(detect)
-
-
 @spread
 def detect(
     memory: MemoryArgument,

@@ -13,11 +13,6 @@ from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("embed")(embed)
-
-
 @spread
 def embed(
     memory: MemoryArgument,

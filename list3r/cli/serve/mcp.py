@@ -21,12 +21,6 @@ _CONNECTIONS = 4
 """To the database of a catalogue, at most."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("mcp")(mcp)
-    app.command("ask-config")(ask_config)
-
-
 def mcp(
     memory: Annotated[Path | None, typer.Argument(metavar="[MEMORY]", help="The memory file.")] = None,
     catalog: Annotated[

@@ -16,11 +16,6 @@ SECRET_VARIABLE = "LIST3R_SERVE_SECRET"
 _FIRST_TOKEN_HOURS = 24.0
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("serve")(serve)
-
-
 def serve(
     catalog: CatalogOption = "catalog.sqlite",
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",

@@ -11,11 +11,6 @@ import typer
 from list3r.cli.common import note
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("view")(view)
-
-
 def view(
     memories: Annotated[
         list[Path], typer.Argument(metavar="MEMORY...", help="The memory file; several are shown side by side.")
