@@ -101,8 +101,8 @@ class BuildRequest:
     depth_every: int | None = field(
         default=None,
         metadata=option(
-            "With colour alone: get depth and things from every N-th frame, and only a pose from the others. Default: "
-            "by how fast the picture moves.",
+            "With colour alone: depth and things from every n-th frame, the others get a pose; default: by how fast "
+            "the picture moves.",
             "N",
         ),
     )
