@@ -109,7 +109,7 @@ def _written_by_columns(rows: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether the matrices have their translations in the last row."""
     found = [_numbers(row.get("transform_matrix")) for row in rows]
     whole = [v for v in found if len(v) == 16 and np.isfinite(v).all()]
-    return bool(whole) and all(v[3] == v[7] == v[11] == 0 and v[15] == 1 and any(v[12:15]) for v in whole)
+    return all(v[3] == v[7] == v[11] == 0 and v[15] == 1 for v in whole) and any(any(v[12:15]) for v in whole)
 
 
 def _file(root: Path, path: Path, row: Mapping[str, Any], turned: bool) -> FrameFile:
