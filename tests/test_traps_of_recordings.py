@@ -12,8 +12,10 @@ import pytest
 
 from list3r.cli.measure.inputs import read_trajectory
 from list3r.frames.base import Frame, FrameSource
+from list3r.frames.convert import convert
+from list3r.frames.live.stream import open_camera
 from list3r.frames.source import open_source
-from list3r.memory.errors import SourceError
+from list3r.memory.errors import OptionError, SourceError
 from tests import recordings
 from tests.recordings import COUNT, DEPTH_HEIGHT, DEPTH_WIDTH, HEIGHT, WIDTH, K, off_plane, plane_depth, png, put
 
@@ -218,3 +220,17 @@ def test_odometry_drifts_by_its_definition(tmp_path: Path) -> None:
     pytest.importorskip("rosbags")
     assert open_source(recordings.write_bag(tmp_path / "a", odometry=True)).info.poses_drift
     assert not open_source(recordings.write_bag(tmp_path / "b")).info.poses_drift
+
+
+def test_poses_that_contradict_their_depth_are_converted_with_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = recordings.arkit
+    monkeypatch.setattr(recordings, "arkit", lambda T: np.linalg.inv(right(T)))
+    report = convert(recordings.write_polycam(tmp_path / "walk"), "tum", tmp_path / "out")
+    assert any("do not fit" in note for note in report.notes)
+
+
+def test_a_webcam_that_is_not_there_is_not_waited_for() -> None:
+    with pytest.raises(OptionError, match="no webcam /dev/video97"):
+        open_camera("/dev/video97", print)
