@@ -3,8 +3,7 @@ ones (which is the most that poses can give).
 
 python benchmarks/given_poses.py --seeds 1,2,3,4,5 --json benchmarks/results/given_poses.json
 python benchmarks/given_poses.py --blind --modes given,prior,estimate --json benchmarks/results/given_poses_blind.json
-python benchmarks/given_poses.py --rooms --seeds 71,72,73,74,75 --modes prior,estimate,given \\
-    --json benchmarks/results/given_poses_rooms.json
+python benchmarks/given_poses.py --rooms --frames 300 --seeds 72,73,74,75,76 --modes given,prior,estimate --keep F
 
 The recording is like Record3D's: depth of 256 x 192 with a LiDAR's noise and confidence, ARKit's poses with a drift of
 1 % and a jump (`simulation/phone.py`). ATE after a rigid alignment; tilt is the angle between the memory's vertical
@@ -61,7 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3,4,5")
     parser.add_argument("--modes", default=",".join(MODES))
-    parser.add_argument("--frames", type=int, default=64, help="pictures of each walk; the whole round has about 115")
+    parser.add_argument("--frames", type=int, help="pictures of each walk; else 64 of about 115, or all of the rooms")
     parser.add_argument("--unsure", type=float, default=1.0, help="so many times larger errors where depth is not sure")
     parser.add_argument("--blind", action="store_true", help="with a bare wall, quick turns and a second of dark")
     parser.add_argument("--rooms", action="store_true", help="through all rooms of a home, the phone lowered at doors")
@@ -88,9 +87,10 @@ def filmed(seed: int, words: argparse.Namespace) -> tuple[WalkSettings, BlindWal
     """Return the walk of a seed, and its way where that has stretches in which the camera cannot be followed."""
     if words.rooms:
         lowered = LoweredSettings()
-        rooms = PresetWalk(seed=seed, preset="loop", path=PathSettings(fps=12.5 / lowered.every))
+        frames = None if words.frames is None else lowered.every * words.frames
+        rooms = PresetWalk(seed=seed, preset="loop", frames=frames, path=PathSettings(fps=12.5 / lowered.every))
         return rooms, lowered_walk(rooms, lowered)
-    walk = WalkSettings(seed=seed, frames=words.frames, path=PACE)
+    walk = WalkSettings(seed=seed, frames=words.frames or 64, path=PACE)
     return walk, blind_walk(walk, BlindSettings()) if words.blind else None
 
 
