@@ -30,6 +30,8 @@ class PriorSettings:
     """What a pose moves against what depth shows from one frame to the next is a jump beyond this,"""
     jump_deg: float = 1.5
     """or beyond this turn."""
+    jump_residual: float = 1.5
+    """A frame that contradicts its step so must fit with no more than so many times the usual residual."""
 
 
 def given_step(before: Poses | None, after: Poses | None) -> Poses | None:

@@ -40,6 +40,8 @@ class TrackedSegment:
     """Positions."""
     usual_inliers: float = 0.0
     """Share of inliers that the last frames had."""
+    usual_residual: float = 1.0
+    """Robust deviation of their depth residuals, in units of the sensor's noise; 1 before there are any."""
 
 
 class CameraTracker:
@@ -192,11 +194,28 @@ class CameraTracker:
         else:
             found.append(self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s))
         possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
+        if given is not None:
+            possible = [f for f in possible if self._believed(segment, given, f)]
         if not possible:
             return None if given is None else given.T_model_cam
         best = max(possible, key=lambda f: f.overlap * f.inliers)
         segment.usual_inliers = max(best.inliers, self.settings.forget * segment.usual_inliers)
+        first = len(segment.T_segment_cam) < 2
+        usual = segment.usual_residual / self.settings.forget
+        segment.usual_residual = best.residual if first else min(best.residual, usual)
         return best.T_model_cam
+
+    def _believed(self, segment: TrackedSegment, given: PosePrior, found: FrameRegistration) -> bool:
+        """Return whether a pose is near the stated step, or fits so well that the given poses must have jumped.
+
+        A blurred picture of a bare floor fits somewhere else, too, if badly (0154).
+        """
+        prior = self.settings.prior
+        off = np.linalg.inv(given.T_model_cam) @ found.T_model_cam
+        if np.linalg.norm(off[:3, 3]) <= prior.jump_m and angle_deg(off) <= prior.jump_deg:
+            return True
+        usual = max(segment.usual_residual, 1.0)
+        return not self._doubtful(segment, found) and found.residual <= prior.jump_residual * usual
 
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
         """Return whether much less agrees than did in the frames before, as in a false minimum."""
