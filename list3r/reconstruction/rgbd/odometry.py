@@ -208,7 +208,7 @@ class CameraTracker:
     def _believed(self, segment: TrackedSegment, given: PosePrior, found: FrameRegistration) -> bool:
         """Return whether a pose is near the stated step, or fits so well that the given poses must have jumped.
 
-        A blurred picture of a bare floor fits somewhere else, too, if badly (0154).
+        A blurred picture of a bare floor fits somewhere else, too, if badly (0153).
         """
         prior = self.settings.prior
         off = np.linalg.inv(given.T_model_cam) @ found.T_model_cam
