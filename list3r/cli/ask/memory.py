@@ -125,6 +125,7 @@ def show(
 
     Example: list3r show house.l3r 12
     """
+    from list3r.importers.base import imported_as
     from list3r.memory.library.labels import label_source
     from list3r.queries.path import telling
 
@@ -137,9 +138,10 @@ def show(
         parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations.of(instance.id)]
         units = scene.units
         named = scene.store.detected_labels.all().get(instance.id)
+        origin = imported_as(scene.store, instance.id)
     if json:
         related = [vars(r) for r in relations]
-        told = {"relations": related, "aliases": aliases, "observed_as": parts}
+        told = {"relations": related, "aliases": aliases, "observed_as": parts, "imported_as": origin}
         print_answer([{**instance_dict(instance, track), **label_source(instance, named), **told}], units)
         return
     say(f"{instance.id}  {instance.label or instance.description}")
@@ -152,6 +154,7 @@ def show(
         *(() if instance.label is None else (("named by", _named_by(instance, named)),)),
         ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
         ("aliases", ", ".join(map(str, aliases)) or "none"),
+        *(() if origin is None else (("imported", f"from {origin['format']} as {', '.join(origin['names'])}"),)),
         *(() if track is None else _track_lines(*track, units)),
     ):
         say(f"  {key:11} {value}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,7 +38,7 @@ def inspect(
     """
     from list3r.exporters.output import replacing
     from list3r.frames.inspection import SourceReport, draw_registration
-    from list3r.frames.pose_agreement import scale_doubts
+    from list3r.frames.pose_agreement import disagreements
     from list3r.frames.source import open_source
 
     options = given.options(more)
@@ -55,8 +54,7 @@ def inspect(
     if overlay is not None:
         with replacing(overlay) as temporary:
             draw_registration(opened, temporary)
-    info = replace(opened.info, notes=(*opened.info.notes, *scale_doubts(opened)))
-    report = SourceReport(info, found, overlay)
+    report = SourceReport(opened.info, found, overlay, disagreements(opened))
     if json:
         print_answer([report.as_dict()])
     else:

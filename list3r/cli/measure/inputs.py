@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from list3r.memory.geometry import Sim3
     from list3r.memory.store.store import Store
 
-_VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
+_SOURCES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".r3d", ".sens", ".bag", ".mcap", ".db3", ".vrs")
 
 
 def is_memory(path: Path) -> bool:
@@ -33,7 +33,7 @@ def is_memory(path: Path) -> bool:
 
 def is_source(path: Path) -> bool:
     """Whether a path is read as frames."""
-    return path.is_dir() or path.suffix.lower() in _VIDEOS
+    return path.is_dir() or path.suffix.lower() in _SOURCES
 
 
 def scale_of(path: Path) -> str:
@@ -87,12 +87,12 @@ def _given(path: Path) -> Trajectory:
     import numpy as np
 
     from list3r.evaluation.trajectory import Trajectory
-    from list3r.frames.folder import FolderSource
     from list3r.frames.source import open_source
     from list3r.memory.errors import OptionError
 
     source = open_source(path)
-    poses = source.read_poses() if isinstance(source, FolderSource) else []
+    read = getattr(source, "read_poses", None)
+    poses = [] if read is None else read()
     if not poses:
         raise OptionError(f"{path} has no poses; give a TUM trajectory file, a memory, or a source with poses")
     return Trajectory(np.array([time_s for _, time_s, _ in poses]), np.stack([T for _, _, T in poses]))

@@ -19,10 +19,12 @@ import numpy as np
 from list3r.frames.live.camera import LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.usbmux import connect, receive
-from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS, VARIES
+from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS
 from list3r.memory.errors import OptionError, SourceError
 
 PORT = 1337
+_VARIES = 0.01
+"""Focal lengths that differ by a larger share are told of."""
 _OUTER = struct.Struct(">4I")
 _HEADER = struct.Struct("<11I")
 _FLOATS = struct.Struct("<11f")
@@ -82,7 +84,7 @@ class Record3dPhone:
                     continue
                 if again:
                     self._say("the phone's poses after a lost connection are of another world and are left out")
-                if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > VARIES:
+                if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > _VARIES:
                     self._say("the focal length changes by more than 1 %: one camera serves all pictures")
                 pose = () if again else frame.pose
                 yield LivePicture(frame.files.copy, " ".join(f"{v:.9g}" for v in pose))

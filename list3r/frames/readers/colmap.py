@@ -58,6 +58,9 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     ]
     if rigged:
         notes.append(f"{len(rigged)} cameras of rigs, one after the other, each where its rig holds it")
+    others = sorted(p.name for p in model.parent.iterdir() if p != model and _is_model(p)) if model.name == "0" else []
+    if others:
+        notes.append(f"the model poses {len(posed)} pictures; not read: the models {', '.join(others)} beside it")
     if len(cameras) > 1:
         notes.append(f"the model has {len(cameras)} cameras; every picture is carried to their median")
     size = (shared.height, shared.width)

@@ -89,7 +89,8 @@ def _frames(file: BinaryIO, path: Path, count: int, size: tuple[int, int]) -> tu
         color = FileSlice(path, start, color_bytes, f"frame-{number:06d}.jpg")
         depth = FileSlice(path, start + color_bytes, depth_bytes, f"frame-{number:06d}.depth")
         packed = CodedArray(depth, "zlib", "<u2", size)
-        files.append(FrameFile(color, packed, T_source_camera=pose_matrix(pose), time_s=1e-6 * color_us or None))
+        time_s = 1e-6 * color_us if color_us or not number else None  # a clock may begin at 0; no clock is all 0
+        files.append(FrameFile(color, packed, T_source_camera=pose_matrix(pose), time_s=time_s))
         file.seek(color_bytes + depth_bytes, 1)
     return files, len(files) == count
 
