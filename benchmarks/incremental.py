@@ -8,11 +8,11 @@ build: edge to the chunk before, revisits, pose graph, library. Three walks: `ro
 sees 12 things and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by
 turn. With `--sessions 2` the memory is that of a session that has ended, and the chunks that are added are the first of
 a later one, which walks the way again from its middle; what has changed is told when that session ends, which is timed
-too (`end_s`; in a long first session it is also looked again at what holds for the whole memory, and all things are
-derived anew where that has changed). `finish_s` is the whole end of a build, which also solves the graph and lets the
-chunks bend; in a long chain that moves nearly all of them. `edit_s` and `undo_s` are an operator's merge and its undo.
-Printed are medians: user seconds of processor time of placing (edges, revisits, graph) and of the library, things
-written anew; what the process had grown by when the memory was made, and its peak then.
+too (`end_s`; of a first session it is that of the library alone, where the build has just ended and nothing has moved
+since). `finish_s` is the whole end of a build, which also solves the graph and lets the chunks bend; in a long chain
+that moves nearly all of them. `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user
+seconds of processor time of placing (edges, revisits, graph) and of the library, things written anew; what the process
+had grown by when the memory was made, and its peak then.
 
 `--walks sessions` is another table: a first session of `--first` chunks through rooms, then 19 later ones of `--repeat`
 chunks each, which all walk where the first one began (`same`), or each a part of the way of its own (`apart`). A row
@@ -122,10 +122,10 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
             row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instances.count())}
             for key in ("placing_s", "library_s", "all_s"):
                 row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
-            row["end_s"] = end(stores[n], words.sessions)
-            row["edit_s"], row["undo_s"] = edited(stores[n])
             if words.sessions == 1:
                 row["finish_s"], row["finish_peak_mb"] = finished(stores[n])
+            row["end_s"] = end(stores[n], words.sessions)
+            row["edit_s"], row["undo_s"] = edited(stores[n])
             row["written"] = int(np.median([r["written"] for r in rows[n]]))
             out.append({**row, "memory_mb": resident[n], "peak_mb": peak[n], "file_mb": size_mb[n]})
     return out
