@@ -117,8 +117,9 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
         raise OptionError(f"{at}: {memory!r} cannot be the name of a memory; use letters, digits, - and _")
     try:
         options = asked.options_of(fields)
-    except TypeError:
-        raise OptionError(f"{at}: one of {', '.join(fields)} is no option of a source; see `list3r build -h`") from None
+    except TypeError as error:
+        unknown = next((name for name in fields if repr(name) in str(error)), ", ".join(fields))
+        raise OptionError(f"{at}: {unknown} is no option of a source; see `list3r build -h`") from None
     except List3rError as error:
         raise OptionError(f"{at}: {error}") from error
     settings = [asdict(options), asdict(asked.request), _shaping(asked.run)]

@@ -100,9 +100,12 @@ def check(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
     from list3r.catalog.catalog import is_stale
 
     with _opened(catalog) as opened:
-        stale = [e for e in opened.memories() if is_stale(e)]
+        known = opened.memories()
+    stale = [e for e in known if is_stale(e)]
     if json:
         print_answer(map(asdict, stale), total=len(stale))
+    elif known and not stale:
+        note(f"{len(known)} {'memory is' if len(known) == 1 else 'memories are'} as catalogued")
     else:
         print_table([[e.name, e.revision, e.instances, e.path] for e in stale], _HEADER)
     if stale:

@@ -145,7 +145,6 @@ class ChangeMatching:
     def _displaced_by(self, n: int, fresh: Sequence[int], session: int) -> int | None:
         """Something new of other looks that is where most of an instance was: two instances are never at one place."""
         p, s = self._p, self._s
-        old = p.looks(n, session, before=True).palette
         for m in fresh:
             if p.component[m] != p.component[n]:
                 continue
@@ -153,9 +152,10 @@ class ChangeMatching:
                 return m
             if p.changed(m, session, before=False) >= s.mostly_new:
                 box = p.box(m, session, before=False, stayed=True)
-                new = p.looks(m, session, before=False).palette
-                inside = p.inside(n, box, 0.0, session, before=True) >= s.displaced
-                if inside and palette_distance(old, new) > s.other_palette:
+                if p.inside(n, box, 0.0, session, before=True) < s.displaced:
+                    continue
+                old, new = (p.looks(k, session, before=k == n).palette for k in (n, m))
+                if palette_distance(old, new) > s.other_palette:
                     return m
         return None
 

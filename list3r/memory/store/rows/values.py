@@ -238,6 +238,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "S_graph_chunk": _SIM3,
         "extent": Rule("typeof({}) = 'blob' AND length({}) = 48", "a box"),
         "dropped": Rule("typeof({}) = 'blob'", "bits"),
+        "carried": Rule("typeof({}) = 'blob' AND length({}) = 32", "four numbers"),
     },
     "overlaps": {"scores": _bytes(36, "six numbers a pair")},
     "members": {"first_chunk": _CHUNK, "first_local": _LOCAL, "shown": _FLAG},
