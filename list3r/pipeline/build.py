@@ -118,4 +118,4 @@ def _check_posed(store: Store, info: SourceInfo, plan: Plan) -> None:
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
     reasons = "; ".join(filter(None, (*lost_reasons(store, plan.session)[:1], hint)))
-    raise TrackingError(f"the camera could not be followed in any frame of {info.path} ({count}); {reasons}")
+    raise TrackingError(f"the camera could not be tracked in any frame of {info.path} ({count}); {reasons}")

@@ -146,7 +146,7 @@ def build_live(
             _follow(ours, target, how, interrupted, watch)
             store, state = target.store, feed.state()
             if not any(f.state == "posed" for f in store.frames.all()):
-                raise TrackingError(f"no frame could be posed in {job.info.path}")
+                raise TrackingError(f"the camera could not be tracked in any frame of {job.info.path}")
             with threadpool_limits(1):
                 finish_session(store, ours.session, job.settings.association, job.settings.carving)
             with store.transaction():
@@ -276,7 +276,7 @@ def _report(ours: LiveSession, state: FeedState, started: float) -> BuildReport:
     )
     notes = [f"the source ended: {state.reason}"]
     if state.dropped:
-        notes.append(f"{state.dropped} of {state.received} pictures were dropped, for the machine could not follow")
+        notes.append(f"{state.dropped} of {state.received} pictures were dropped, because the machine was too slow")
     if waiting:
         notes.append(f"{waiting} pictures were still waiting and are left out")
     if state.reconnects:

@@ -167,7 +167,7 @@ def _update_notes(chunks: int, placed: int, held: int, lost: int, frames: int) -
     elif placed < chunks:
         notes.append(f"{chunks - placed} of {chunks} chunks could not be placed; they are kept apart")
     if lost:
-        notes.append(f"the camera could not be followed in {lost} of {frames} frames; they have no pose")
+        notes.append(f"the camera could not be tracked in {lost} of {frames} frames; they have no pose")
     return tuple(notes)
 
 
@@ -194,12 +194,12 @@ def _build_notes(store: Store, session: int, lost: int, bad: int, components: in
         notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
     elif lost:
         where = _runs([f.frame_index for f in store.frames.all(session) if f.state == "lost"])
-        notes.append(f"the camera could not be followed in {_count(lost, 'frame')} ({where}); they have no pose")
+        notes.append(f"the camera could not be tracked in {_count(lost, 'frame')} ({where}); they have no pose")
     notes += lost_reasons(store, session)
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
     if store.facts.gravity == "unknown":
-        notes.append("which way is up could not be told; vertical relations (on, above, below) are left out")
+        notes.append("which way is up is unknown; vertical relations (on, above, below) are left out")
     return tuple(notes)
 
 

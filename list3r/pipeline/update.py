@@ -100,7 +100,7 @@ def _check_posed(store: Store, session: int, info: SourceInfo) -> None:
     if not _begun(store, session):
         why = lost_reasons(store, session)
         reasons = "; ".join(("the memory is as it was", *why[:1]))
-        raise TrackingError(f"the camera could not be followed in any frame of {info.path}; {reasons}")
+        raise TrackingError(f"the camera could not be tracked in any frame of {info.path}; {reasons}")
 
 
 def _session(store: Store, job: Job) -> int:

@@ -10,7 +10,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.find import meant
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.finding.grammar import parse
-from list3r.queries.finding.words import STRUCTURE, not_borne, wanted_words, word_score
+from list3r.queries.finding.words import STRUCTURE, no_such_words, wanted_words, word_score
 from list3r.queries.match import Filters
 from list3r.queries.views.gather import is_large, sample
 
@@ -38,7 +38,7 @@ def called(
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
     if not named and (unknown := [w for w in wanted_words(words) if w not in store.words.known([w])]):
-        notes.append(not_borne(unknown, sample(store)))
+        notes.append(no_such_words(unknown, sample(store)))
     return named
 
 

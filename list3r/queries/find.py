@@ -13,7 +13,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.finding.grammar import SIZES, SUPERLATIVES, Phrase, parse
 from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
-from list3r.queries.finding.words import STRUCTURE, not_borne
+from list3r.queries.finding.words import STRUCTURE, no_such_words
 from list3r.queries.match import Match, Matches, checked_count, checked_instance
 from list3r.queries.relations import Place, viewer_from
 from list3r.queries.views.gather import Gathered, gather, is_large
@@ -154,7 +154,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
             return by_vector
         search.unknown += unknown
         named = search.things.values() if search.gathered is None else search.store.instances.of(search.gathered.sample)
-        search.notes.append(not_borne(unknown, named))
+        search.notes.append(no_such_words(unknown, named))
         return []
     structure = not STRUCTURE.isdisjoint(phrase.words) or bool(
         phrase.words

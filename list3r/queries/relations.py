@@ -12,7 +12,7 @@ from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
-from list3r.queries.finding.words import not_borne, wanted_words, words_of
+from list3r.queries.finding.words import no_such_words, wanted_words, words_of
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera
 from list3r.queries.views.gather import is_large, sample
@@ -136,7 +136,7 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
         else:
             found = [i.id for i in store.instances.all() if wanted <= words_of(i)]
         if not found and (unknown := sorted(wanted - store.words.known(wanted))):
-            notes.append(not_borne(unknown, sample(store)))
+            notes.append(no_such_words(unknown, sample(store)))
         return found
     return [checked_instance(store, int(what.removeprefix("#")) if isinstance(what, str) else what).id]
 

@@ -147,7 +147,7 @@ class _SceneWriter:
         units, gravity = self.memory.units, self.memory.gravity
         solid = sum(i.structure is None for i in self.things)
         scale = "Lengths: cm." if units == "m" else "Lengths: arbitrary units, the scale is unknown."
-        up = "z is up." if gravity != "unknown" else "Which way is up is unknown, so nothing is told of on or above."
+        up = "z is up." if gravity != "unknown" else "Which way is up is unknown, so on and above are left out."
         parts = f" {self.parts} parts that are not placed against each other." if self.parts > 1 else ""
         lines = [
             f"# {self.memory.path.name}: {solid} things, {len(self.things) - solid} of structure",

@@ -193,7 +193,10 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> Stamps:
         known, keys = np.sort(shown), np.sort(shown[rows[:, 2] > 0])
         once = np.searchsorted(known, keys, side="right") - np.searchsorted(known, keys, side="left") == 1
         if joined:
-            notes = (*notes, "its clock begins anew on the way and is joined, as where files were put together")
+            notes = (
+                *notes,
+                "its clock starts again on the way, as in files that were put together; the parts are joined",
+            )
         begins = np.zeros(0, np.int64) if counted else keys[once]
         return Stamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)
     none = np.zeros(0, np.int64)

@@ -232,7 +232,9 @@ def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -
 def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, bring_back: Before = ()) -> EditReport:
     """Write the edit down, derive the library anew, and see to it that every id still resolves."""
     if any(not keys for _, _, keys in edit.before):
-        raise OptionError(f"{store.path} does not hold what {names[0]} was made from; only its label can be changed")
+        raise OptionError(
+            f"{store.path} does not hold the local instances of {names[0]}; only its label can be changed"
+        )
     edit = _write_down(store, edit, names, reason)
     there = {i.id for i in store.instances.all()}
     aliases = store.ids.aliases()

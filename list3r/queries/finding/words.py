@@ -54,7 +54,7 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
     return total / len(wanted), hit
 
 
-def not_borne(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:
+def no_such_words(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:
     """Say that no instance has some words, and what most things are called (the last words of names)."""
     said = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
     count = Counter(word for last in said for word in last)
