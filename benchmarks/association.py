@@ -77,31 +77,31 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="presets kidnap and twins, seeds 1 and 2")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path, help="picture of the table: ATE of every seed by preset and variant")
-    words = parser.parse_args()
-    if words.quick:
-        words.presets, words.seeds = "kidnap,twins", "1,2"
-    presets, variants = words.presets.split(","), words.variants.split(",")
+    args = parser.parse_args()
+    if args.quick:
+        args.presets, args.seeds = "kidnap,twins", "1,2"
+    presets, variants = args.presets.split(","), args.variants.split(",")
     for given, known in ((presets, (*PRESETS, *RETURNS)), (variants, TITLES)):
         if unknown := sorted(set(given) - set(known)):
             parser.error(f"unknown: {', '.join(unknown)}; choose from {', '.join(known)}")
-    rows = _resumed(words.json)
+    rows = _resumed(args.json)
     done_jobs = {(r["preset"], r["seed"]) for r in rows}
-    jobs = [(preset, int(seed), tuple(variants), words.joint) for seed in words.seeds.split(",") for preset in presets]
+    jobs = [(preset, int(seed), tuple(variants), args.joint) for seed in args.seeds.split(",") for preset in presets]
     jobs = [job for job in jobs if job[:2] not in done_jobs]
-    with OrderedPool(run_video, words.workers) as pool:
+    with OrderedPool(run_video, args.workers) as pool:
         for done in pool.map(jobs):
             rows += done
             ates = "  ".join(f"{r['variant']} {r['ate_sim3_m']:.3f}" for r in done)
             print(f"{done[0]['preset']} seed {done[0]['seed']}: ATE m  {ates}", flush=True)
-            write_json(words.json, {"unfinished": True, "joint": words.joint, "runs": rows})
+            write_json(args.json, {"unfinished": True, "joint": args.joint, "runs": rows})
     judgements = [(r["preset"], r["variant"], _judgement(r.pop("judgement"))) for r in rows]
     summary = summarise(rows, presets, variants)
     print_tables(summary, presets, variants)
     revisits = revisit_table(judgements, presets, "full" if "full" in variants else variants[-1])
     print(machine())
-    write_json(words.json, {"joint": words.joint, "summary": summary, "revisits": revisits, "runs": rows})
-    if words.plot is not None:
-        plot(words.plot, rows, presets, variants)
+    write_json(args.json, {"joint": args.joint, "summary": summary, "revisits": revisits, "runs": rows})
+    if args.plot is not None:
+        plot(args.plot, rows, presets, variants)
 
 
 def _resumed(path: Path | None) -> list[dict[str, Any]]:

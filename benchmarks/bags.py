@@ -46,16 +46,16 @@ def main() -> None:
     parser.add_argument("--gigabytes", type=float, default=1.0)
     parser.add_argument("--kinds", default="mcap,db3,mcap-zstd,mcap-cut,bag-lz4")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
-    for kind in words.kinds.split(","):
+    for kind in args.kinds.split(","):
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / "walk"
-            path = write(path, kind, int(words.gigabytes * 1e9 / FRAME_BYTES))
+            path = write(path, kind, int(args.gigabytes * 1e9 / FRAME_BYTES))
             rows.append({"kind": kind, **read(path)})
             print(json.dumps(rows[-1]), flush=True)
     print(machine())
-    write_json(words.json, {"rows": rows})
+    write_json(args.json, {"rows": rows})
 
 
 def write(path: Path, kind: str, frames: int) -> Path:

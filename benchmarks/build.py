@@ -21,18 +21,18 @@ def main() -> None:
     parser.add_argument("--frames", help="START:STOP, to see how memory grows with the length")
     parser.add_argument("--intrinsics")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    options = ["--poses", words.poses]
+    args = parser.parse_args()
+    options = ["--poses", args.poses]
     for name in ("frames", "intrinsics"):
-        if getattr(words, name):
-            options += [f"--{name}", getattr(words, name)]
+        if getattr(args, name):
+            options += [f"--{name}", getattr(args, name)]
     with tempfile.TemporaryDirectory() as folder:
         memory = str(Path(folder) / "memory.l3r")
-        report, usage = run_list3r("build", words.source, "-m", memory, *options)
-        errors, _ = run_list3r("eval", "trajectory", words.source, memory)
+        report, usage = run_list3r("build", args.source, "-m", memory, *options)
+        errors, _ = run_list3r("eval", "trajectory", args.source, memory)
         size_mb = Path(memory).stat().st_size / 1e6
     result = {
-        "source": Path(words.source).name,
+        "source": Path(args.source).name,
         "options": options,
         "frames": report["frames"],
         "posed": report["posed"],
@@ -49,7 +49,7 @@ def main() -> None:
     print(machine())
     for key, value in result.items():
         print(f"{key:20} {value}")
-    write_json(words.json, result)
+    write_json(args.json, result)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ near the same places. `list3r build` makes a memory of the first walk, `list3r u
 counts as placed where all its chunks lie in the world of the first and its cameras are off by at most 0.1 m and 3
 degrees (medians) when the world is laid on the truth by the cameras of the first session alone, turned by their mean
 rotation. What stands in the JSON already is not done again, and walks and memories in --keep are used as they are.
-With --strangers the second session of each next home is added to the memory of a home in --keep, where it must stay
+With --other-homes the second session of each next home is added to the memory of a home in --keep, where it must stay
 apart.
 """
 
@@ -44,22 +44,22 @@ def main() -> None:
     parser.add_argument("--seeds", default="401-420", help="first-last")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
-    parser.add_argument("--strangers", action="store_true", help="add sessions to memories of other homes in --keep")
-    words = parser.parse_args()
-    first, last = (int(n) for n in words.seeds.split("-"))
-    if words.strangers:
-        write_json(words.json, strangers(words.keep, range(first, last + 1)))
+    parser.add_argument("--other-homes", action="store_true", help="add sessions to memories of other homes in --keep")
+    args = parser.parse_args()
+    first, last = (int(n) for n in args.seeds.split("-"))
+    if args.other_homes:
+        write_json(args.json, other_homes(args.keep, range(first, last + 1)))
         return
-    rows = json.loads(words.json.read_text())["homes"] if words.json and words.json.exists() else []
+    rows = json.loads(args.json.read_text())["homes"] if args.json and args.json.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(first, last + 1):
             if any(row["seed"] == seed for row in rows):
                 continue
             rows.append(
-                {"seed": seed, "commit": STARTED_AT, **one_home((words.keep or Path(scratch)) / str(seed), seed)}
+                {"seed": seed, "commit": STARTED_AT, **one_home((args.keep or Path(scratch)) / str(seed), seed)}
             )
             print(json.dumps(rows[-1]), flush=True)
-            write_json(words.json, {"homes": rows, "total": total(rows)})
+            write_json(args.json, {"homes": rows, "total": total(rows)})
     print(machine())
     print(json.dumps(total(rows), indent=1))
 
@@ -118,7 +118,7 @@ def offset(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[flo
     return float(np.median(off_m)), float(np.degrees(np.median(turned.magnitude())))
 
 
-def strangers(keep: Path, seeds: Sequence[int]) -> dict[str, Any]:
+def other_homes(keep: Path, seeds: Sequence[int]) -> dict[str, Any]:
     """Add the second session of each next home to the memory of a home, where it must stay apart."""
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:

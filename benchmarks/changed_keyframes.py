@@ -44,13 +44,13 @@ def main() -> None:
     parser.add_argument("--seeds", default="441-460", help="first-last")
     parser.add_argument("--every", type=int, default=5, help="frames between keyframes")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    first, last = (int(n) for n in words.seeds.split("-"))
+    args = parser.parse_args()
+    first, last = (int(n) for n in args.seeds.split("-"))
     rows: list[dict[str, Any]] = []
     before: Sessions | None = None
     for seed in range(first, last + 1):
         started = time.process_time()
-        home = _filmed(seed, words.every)
+        home = _filmed(seed, args.every)
         row = {"seed": seed, "commit": STARTED_AT, **_judged(home)}
         if before is not None:
             mixed = (before[0], home[1]), (home[0], before[1])
@@ -58,7 +58,7 @@ def main() -> None:
         rows.append(row | {"cpu_s": round(time.process_time() - started, 1)})
         before = home
         print(json.dumps(rows[-1]), flush=True)
-        write_json(words.json, {"every": words.every, "homes": rows, "total": total(rows)})
+        write_json(args.json, {"every": args.every, "homes": rows, "total": total(rows)})
     print(machine())
     print(json.dumps(total(rows), indent=1))
 

@@ -53,20 +53,20 @@ def main() -> None:
     parser.add_argument("--house", type=Path, help="folder of aws-robomaker-small-house-world")
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        for seed in seeds_of(words.seeds):
-            root = (words.keep or Path(scratch)) / f"{'house' if words.house else 'world'}-{seed}"
+        for seed in seeds_of(args.seeds):
+            root = (args.keep or Path(scratch)) / f"{'house' if args.house else 'world'}-{seed}"
             if not (root / "second" / "truth.json").exists():
-                film_twice(root, seed, words.house)
-            for method in words.methods.split(","):
+                film_twice(root, seed, args.house)
+            for method in args.methods.split(","):
                 rows.append({"method": method, "seed": seed, **one_home(root, method)})
                 print(json.dumps(rows[-1]), flush=True)
     table = {m: total([r for r in rows if r["method"] == m]) for m in dict.fromkeys(r["method"] for r in rows)}
     print(machine())
     print(json.dumps(table, indent=1))
-    write_json(words.json, {"frames": FRAMES, "total": table, "homes": rows})
+    write_json(args.json, {"frames": FRAMES, "total": table, "homes": rows})
 
 
 def film_twice(root: Path, seed: int, house: Path | None) -> None:

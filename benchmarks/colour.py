@@ -81,19 +81,19 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="of each walk; without it 150 of such walks, else all")
     parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    if words.step is not None:
-        words.frames = words.frames or 150
-        compare_walks(words)
+    args = parser.parse_args()
+    if args.step is not None:
+        args.frames = args.frames or 150
+        compare_walks(args)
         return
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
-        root = words.keep or Path(scratch)
-        for seed, method in ((int(w), m) for w in words.seeds.split(",") for m in words.discovery.split(",")):
-            figures = measured(root / f"seed-{seed}", seed, words.workers, method, words.frames)
+        root = args.keep or Path(scratch)
+        for seed, method in ((int(w), m) for w in args.seeds.split(",") for m in args.discovery.split(",")):
+            figures = measured(root / f"seed-{seed}", seed, args.workers, method, args.frames)
             rows.append({"seed": seed, "discovery": method or "default", **figures})
             print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-            write_json(words.json, {"mean": means_of(rows), "seeds": rows})
+            write_json(args.json, {"mean": means_of(rows), "seeds": rows})
     print(machine())
     for key, value in means_of(rows).items():
         print(f"{key:24} {value}")

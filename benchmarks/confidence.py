@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import calibration
 from colour import EVERY, LEAST_PX, SIZE, colour_only, compare_masks, memory_masks, true_masks
 from discovery import MIN_PX, seeds_of
 from discovery_memory import film_of, write_film
@@ -27,7 +28,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import list3r
-from list3r.evaluation.calibration import calibration
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import read_scene
 from list3r.memory.library.evidence import EvidenceSettings
@@ -53,11 +53,11 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, required=True, help="folder of walks and memories; what is there is kept")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for kind in KINDS:
-        for seed in seeds_of(getattr(words, kind)) if getattr(words, kind) else []:
-            walk = words.keep / f"{kind}-{seed}"
+        for seed in seeds_of(getattr(args, kind)) if getattr(args, kind) else []:
+            walk = args.keep / f"{kind}-{seed}"
             found = judged(built(walk, kind, seed), walk, kind)
             rows.append({"kind": kind, "seed": seed, **found})
             print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
@@ -65,9 +65,9 @@ def main() -> None:
     print(machine())
     for kind, entry in table.items():
         print(kind, json.dumps(entry))
-    if words.fit:
+    if args.fit:
         print(fitted(rows))
-    write_json(words.json, {"mean": table, "walks": rows})
+    write_json(args.json, {"mean": table, "walks": rows})
 
 
 def built(walk: Path, kind: str, seed: int) -> Path:

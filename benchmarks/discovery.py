@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import calibration
 from machine import machine, write_json
 from numpy.typing import NDArray
 
-from list3r.evaluation.calibration import calibration
 from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.instances.base import Discoverer, Proposals
 from list3r.instances.geometric.support import thin, without_fliers
@@ -53,12 +53,12 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
     parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it beside")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    weights = {"learned": words.weights} | {n: Path(f) for n, _, f in (text.partition("=") for text in words.also)}
-    methods = [*filter(None, words.methods.split(",")), *(n for n in weights if n != "learned")]
-    for seed in seeds_of(words.seeds):
-        film = film_of(seed, words.sensor, words.house, fitted=words.fitted)
+    weights = {"learned": args.weights} | {n: Path(f) for n, _, f in (text.partition("=") for text in args.also)}
+    methods = [*filter(None, args.methods.split(",")), *(n for n in weights if n != "learned")]
+    for seed in seeds_of(args.seeds):
+        film = film_of(seed, args.sensor, args.house, fitted=args.fitted)
         for method in methods:
             said = judge(film, seed, method, weights.get(method))
             rows.append({"method": method, "seed": seed, "sensor": film[0].sensor, **said})
@@ -67,8 +67,8 @@ def main() -> None:
     print(machine())
     for method, entry in table.items():
         print(method, json.dumps(entry))
-    source = "house" if words.house else "fitted worlds" if words.fitted else "worlds"
-    write_json(words.json, {"source": source, "least_px": MIN_PX, "mean": table, "walks": rows})
+    source = "house" if args.house else "fitted worlds" if args.fitted else "worlds"
+    write_json(args.json, {"source": source, "least_px": MIN_PX, "mean": table, "walks": rows})
 
 
 def seeds_of(text: str) -> list[int]:

@@ -32,10 +32,10 @@ from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CutSettings, join_parts, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
-from list3r.instances.learned.network import judge
+from list3r.instances.learned.network import classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.superpoints import cut_superpoints
-from list3r.instances.learned.things import judge_things
+from list3r.instances.learned.things import classify_things
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.library import select_prompts
 from training.samples import chunk_settings, voxel_truth
@@ -62,18 +62,18 @@ def main() -> None:
     parser.add_argument("--house", type=Path)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    for seed in seeds_of(words.seeds):
-        film, every = film_of(seed, None, words.house, fitted=words.fitted)
-        for rung, said in climb(film, every, seed, words.weights).items():
+    for seed in seeds_of(args.seeds):
+        film, every = film_of(seed, None, args.house, fitted=args.fitted)
+        for rung, said in climb(film, every, seed, args.weights).items():
             rows.append({"rung": rung, "seed": seed, **said, "cpu_s": 0.0, "frames": 1})
     table = {r: summary([row for row in rows if row["rung"] == r]) for r in dict.fromkeys(row["rung"] for row in rows)}
     print(machine())
     for rung, entry in table.items():
         print(f"{rung:12}", *(f"{entry[k]:6.3f}" for k in SHOWN))
-    source = "house" if words.house else "fitted worlds" if words.fitted else "worlds"
-    write_json(words.json, {"source": source, "mean": table, "walks": rows})
+    source = "house" if args.house else "fitted worlds" if args.fitted else "worlds"
+    write_json(args.json, {"source": source, "mean": table, "walks": rows})
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np
     pieces = cut_pieces(surface)
     out["pieces"] = named(chunk, majority(chunk, pieces.labels))
     g = pieces.graph
-    first = agglomerate(len(g.nodes), g.left, g.right, judge(weights, "fine", g).affinity, g.weight, s.sure)
+    first = agglomerate(len(g.nodes), g.left, g.right, classify(weights, "fine", g).affinity, g.weight, s.sure)
     out["parts"] = named(chunk, majority(chunk, pieces.joined(first)))
     parts, coarse, told = join_parts(surface, pieces, weights, s)
     out["joined"] = named(chunk, majority(chunk, parts))
@@ -152,7 +152,7 @@ def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
     out["cut"] = best_of(chunk, [labels])
-    verdicts = judge_things(weights, own, coarse, told)
+    verdicts = classify_things(weights, own, coarse, told)
     free = verdicts.structure <= 0.5
     out["bound"] = best_of(chunk, [np.where(np.append(free, False)[labels], labels, -1)])
     out["unlisted"] = labels, ~free

@@ -49,22 +49,22 @@ def main() -> None:
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
     parser.add_argument("--keep", type=Path, help="folder in which walks are kept")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        for seed in seeds_of(words.seeds):
-            kind = "house" if words.house else "fitted" if words.fitted else "world"
-            walk = (words.keep or Path(scratch)) / f"{kind}-{seed}"
+        for seed in seeds_of(args.seeds):
+            kind = "house" if args.house else "fitted" if args.fitted else "world"
+            walk = (args.keep or Path(scratch)) / f"{kind}-{seed}"
             if not (walk / "truth.json").exists():
-                write_film(walk, film_of(seed, words.house, fitted=words.fitted), seed)
-            for method in words.methods.split(","):
+                write_film(walk, film_of(seed, args.house, fitted=args.fitted), seed)
+            for method in args.methods.split(","):
                 rows.append({"method": method, "seed": seed, **measured(walk, method)})
                 print(json.dumps(rows[-1]), flush=True)
     table = {m: summary([r for r in rows if r["method"] == m]) for m in dict.fromkeys(r["method"] for r in rows)}
     print(machine())
     for method, entry in table.items():
         print(method, json.dumps(entry))
-    write_json(words.json, {"frames": FRAMES, "mean": table, "walks": rows})
+    write_json(args.json, {"frames": FRAMES, "mean": table, "walks": rows})
 
 
 def film_of(seed: int, house: Path | None, *, fitted: bool) -> Film:

@@ -53,20 +53,20 @@ def main() -> None:
     parser.add_argument("--formats", default=",".join([*FORMATS, "plan.svg"]))
     parser.add_argument("--limit", type=float, default=600.0, help="Processor seconds of one export, at most.")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
-    words = parser.parse_args()
-    done = json.loads(words.json.read_text(encoding="utf-8")) if words.json and words.json.exists() else {}
+    args = parser.parse_args()
+    done = json.loads(args.json.read_text(encoding="utf-8")) if args.json and args.json.exists() else {}
     rows: list[dict[str, Any]] = done.get("rows", [])
     with tempfile.TemporaryDirectory() as folder:
-        for count in (int(word) for word in words.instances.split(",")):
+        for count in (int(word) for word in args.instances.split(",")):
             known = {r["format"] for r in rows if r["instances"] == count}
-            names = [n for n in words.formats.split(",") if n not in known and is_here(n)]
+            names = [n for n in args.formats.split(",") if n not in known and is_here(n)]
             memory = Path(folder) / f"made-{count}.l3r"
             if names:
                 write_memory(memory, count)
             for name in names:
-                rows.append({"instances": count, **measure(memory, name, Path(folder) / "out", words.limit)})
+                rows.append({"instances": count, **measure(memory, name, Path(folder) / "out", args.limit)})
                 print(rows[-1], flush=True)
-                write_json(words.json, {"rows": rows})
+                write_json(args.json, {"rows": rows})
             memory.unlink(missing_ok=True)
 
 

@@ -39,16 +39,16 @@ def main() -> None:
     parser.add_argument("--presets", default="calm,loop,corridor")
     parser.add_argument("--seeds", default="101,102,103")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     print(machine())
     rows = []
-    for preset in words.presets.split(","):
-        for seed in words.seeds.split(","):
+    for preset in args.presets.split(","):
+        for seed in args.seeds.split(","):
             rows.append(measure(preset, int(seed)))
             print(
                 "  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{v}" for k, v in rows[-1].items()), flush=True
             )
-    write_json(words.json, {"runs": rows})
+    write_json(args.json, {"runs": rows})
 
 
 def measure(preset: str, seed: int) -> dict[str, Any]:

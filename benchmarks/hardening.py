@@ -43,33 +43,33 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    if words.list:
-        told = before_after.run_list(words.json)
+    args = parser.parse_args()
+    if args.list:
+        told = before_after.run_list(args.json)
         print(before_after.table(told))
         raise SystemExit(1 if before_after.open_rows(told) else 0)
     parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {
-        "damages": (damages.batch, words.damages),
-        "command lines": (command_lines.batch, words.command_lines),
-        "lies": (lying.batch, words.lies),
+        "damages": (damages.batch, args.damages),
+        "command lines": (command_lines.batch, args.command_lines),
+        "lies": (lying.batch, args.lies),
     }
     problems = 0
-    if words.bombs:
+    if args.bombs:
         with tempfile.TemporaryDirectory() as folder:
             told = bombs.run_bombs(Path(folder))
-        Run(words.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(told)
+        Run(args.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(told)
         problems += len(told["problems"])
     for key, (work, count) in parts.items():
         if count:
-            problems += len(_part(key, work, count, words)["problems"])
+            problems += len(_part(key, work, count, args)["problems"])
     raise SystemExit(1 if problems else 0)
 
 
-def _part(key: str, work: Callable[[Path, int, int], Batch], count: int, words: argparse.Namespace) -> dict[str, Any]:
+def _part(key: str, work: Callable[[Path, int, int], Batch], count: int, args: argparse.Namespace) -> dict[str, Any]:
     batches = -(-count // EACH)
-    run = Run(words.json, key, {"tries": batches * EACH, "seed": words.seed})
+    run = Run(args.json, key, {"tries": batches * EACH, "seed": args.seed})
     with tempfile.TemporaryDirectory(dir=_fast_folder()) as folder:
-        run.go(functools.partial(work, Path(folder), words.seed), batches, words.processes)
+        run.go(functools.partial(work, Path(folder), args.seed), batches, args.processes)
     told = run.finish()
     print(key, json.dumps(told, indent=2), flush=True)
     return told

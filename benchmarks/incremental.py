@@ -8,11 +8,15 @@ build: edge to the chunk before, revisits, pose graph, library. Three walks: `ro
 sees 12 things and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by
 turn. With `--sessions 2` the memory is that of a session that has ended, and the chunks that are added are the first of
 a later one, which walks the way again from its middle; what has changed is told when that session ends, which is timed
-too (`end_s`; in a long first session it is also looked again at what holds for the whole memory, and all things are
-derived anew where that has changed). `finish_s` is the whole end of a build, which also solves the graph and lets the
-chunks bend; in a long chain that moves nearly all of them. `edit_s` and `undo_s` are an operator's merge and its undo.
-Printed are medians: user seconds of processor time of placing (edges, revisits, graph) and of the library, things
-written anew; what the process had grown by when the memory was made, and its peak then.
+too (`end_s`; of a first session it is that of the library alone, where the build has just ended and nothing has moved
+since). `finish_s` is the whole end of a build, which also solves the graph and lets the chunks bend; in a long chain
+that moves nearly all of them. `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user
+seconds of processor time of placing (edges, revisits, graph) and of the library, things written anew; what the process
+had grown by when the memory was made, and its peak then.
+
+`--walks sessions` is another table: a first session of `--first` chunks through rooms, then 19 later ones of `--repeat`
+chunks each, which all walk where the first one began (`same`), or each a part of the way of its own (`apart`). A row
+says what a chunk of a session costs, its end, and the peak of the process.
 """
 
 from __future__ import annotations
@@ -41,6 +45,8 @@ SEEN, STEP = 12, 6
 SPACING_M = 0.9
 FRAMES, HOP = 20, 14
 SPACE = "synthetic@1/64"
+SESSIONS = 20
+"""Sessions of a memory that has many."""
 WALKS = ("rooms", "corridor", "stay")
 IMAGE = (480, 640)
 LENS = (500.0, 500.0, 320.0, 240.0)
@@ -53,7 +59,8 @@ SAMPLES, KEYFRAMES, WORDS = 150, 2, 384
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--chunks", default="10,100,1000", help="sizes of memories to which a chunk is added")
-    parser.add_argument("--walks", default="rooms,corridor,stay", help="some of rooms, corridor, stay")
+    parser.add_argument("--walks", default="rooms,corridor,stay", help="some of rooms, corridor, stay, sessions")
+    parser.add_argument("--first", type=int, default=120, help="chunks of the first of many sessions")
     parser.add_argument("--stay-chunks", type=int, default=100, help="most chunks of the walk that stays")
     parser.add_argument("--repeat", type=int, default=15, help="chunks that are added to each memory and timed")
     parser.add_argument(
@@ -66,6 +73,11 @@ def main() -> None:
     found: dict[str, list[dict[str, Any]]] = {}
     print(machine())
     for name in words.walks.split(","):
+        if name == "sessions":
+            for kind in ("same", "apart"):
+                found[f"sessions, {kind}"] = many_sessions(kind, words)
+                write_json(words.json, {"walks": found})
+            continue
         sizes = [int(n) for n in words.chunks.split(",") if name != "stay" or int(n) <= words.stay_chunks]
         found[name] = measure(name, sizes, words)
         for row in found[name]:
@@ -96,7 +108,9 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
         rows: dict[int, list[dict[str, float]]] = {n: [] for n in sizes}
         for turn in range(words.repeat):
             for n in sizes:
-                result = chunk(n + turn, name, words.seed) if words.sessions == 1 else again(n, turn, name, words.seed)
+                result = (
+                    chunk(n + turn, name, words.seed) if words.sessions == 1 else again(n // 2, turn, name, words.seed)
+                )
                 if words.profile and n == sizes[-1]:
                     watched.enable()
                 rows[n].append(add(stores[n], result, words.sessions))
@@ -108,12 +122,35 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
             row: dict[str, Any] = {"chunks": n, "instances": sum(stores[n].instances.count())}
             for key in ("placing_s", "library_s", "all_s"):
                 row[key] = round(float(np.median([r[key] for r in rows[n]])), 4)
-            row["end_s"] = end(stores[n], words.sessions)
-            row["edit_s"], row["undo_s"] = edited(stores[n])
             if words.sessions == 1:
                 row["finish_s"], row["finish_peak_mb"] = finished(stores[n])
+            row["end_s"] = end(stores[n], words.sessions)
+            row["edit_s"], row["undo_s"] = edited(stores[n])
             row["written"] = int(np.median([r["written"] for r in rows[n]]))
             out.append({**row, "memory_mb": resident[n], "peak_mb": peak[n], "file_mb": size_mb[n]})
+    return out
+
+
+def many_sessions(kind: str, words: argparse.Namespace) -> list[dict[str, Any]]:
+    """What a chunk of each of many sessions costs, and the end of the session."""
+    out: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "many.l3r") as store:
+        begin(store, words.first)
+        for k in range(words.first):
+            add(store, chunk(k, "rooms", words.seed))
+        finished(store)
+        for session in range(2, SESSIONS + 1):
+            begin(store, words.repeat)
+            start = 0 if kind == "same" else (session - 2) * words.repeat % (words.first - words.repeat)
+            rows = [
+                add(store, again(start, turn, "rooms", words.seed, session), session) for turn in range(words.repeat)
+            ]
+            row: dict[str, Any] = {"session": session, "chunks": len(store.chunks.all())}
+            row["instances"] = sum(store.instances.count())
+            row |= {key: round(float(np.median([r[key] for r in rows])), 4) for key in ("library_s", "all_s")}
+            row |= {"end_s": end(store, session), "peak_mb": peak_mb()}
+            out.append(row)
+            print(f"sessions, {kind}  " + "  ".join(f"{k} {v}" for k, v in row.items()), flush=True)
     return out
 
 
@@ -152,10 +189,10 @@ def edited(store: Store) -> tuple[float, float]:
     return round(merged - started, 3), round(user_s() - merged, 3)
 
 
-def again(n: int, turn: int, name: str, seed: int) -> ChunkResult:
-    """Chunk `turn` of a later session, which sees what the first one saw from its middle on, with other errors."""
-    made = chunk(n // 2 + turn, name, seed)
-    rng = np.random.default_rng([seed, 8, turn])
+def again(start: int, turn: int, name: str, seed: int, session: int = 2) -> ChunkResult:
+    """Chunk `turn` of a later session, which sees what the first one saw from chunk `start` on, with other errors."""
+    made = chunk(start + turn, name, seed)
+    rng = np.random.default_rng([seed, 8, turn, session])
     off = rng.normal(0.0, 0.003, 3)
     frames = np.arange(HOP * turn, HOP * turn + FRAMES)
 

@@ -42,27 +42,27 @@ def main() -> None:
     parser.add_argument("--kinds", default="sift,aliked")
     parser.add_argument("--weights", type=Path, help="folder with aliked/")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     cv2.setNumThreads(1)
     rows = []
-    for kind in words.kinds.split(","):
-        detector = None if kind == "sift" else make_detector(kind, words.weights / FILES[kind])
-        for every in (int(n) for n in words.every.split(",")):
-            for start in (int(n) for n in words.starts.split(",")):
-                rows.append({"kind": kind, "every": every, "start": start, **_measured(words, every, start, detector)})
+    for kind in args.kinds.split(","):
+        detector = None if kind == "sift" else make_detector(kind, args.weights / FILES[kind])
+        for every in (int(n) for n in args.every.split(",")):
+            for start in (int(n) for n in args.starts.split(",")):
+                rows.append({"kind": kind, "every": every, "start": start, **_measured(args, every, start, detector)})
                 print(rows[-1], flush=True)
     print(machine())
-    write_json(words.json, {"source": words.source.name, "rows": rows})
+    write_json(args.json, {"source": args.source.name, "rows": rows})
 
 
-def _measured(words: argparse.Namespace, every: int, start: int, detector: LearnedDetector | None) -> dict[str, Any]:
+def _measured(args: argparse.Namespace, every: int, start: int, detector: LearnedDetector | None) -> dict[str, Any]:
     options = SourceOptions(
         every=every,
         start=start,
-        intrinsics=parse_intrinsics(words.intrinsics) if words.intrinsics else None,
-        distortion=parse_distortion(words.distortion) if words.distortion else None,
+        intrinsics=parse_intrinsics(args.intrinsics) if args.intrinsics else None,
+        distortion=parse_distortion(args.distortion) if args.distortion else None,
     )
-    source = open_source(words.source, options)
+    source = open_source(args.source, options)
     frames = [f for f in source.read(0, source.info.frame_count) if isinstance(f, Frame)]
     grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
     camera = source.info.camera or guessed_camera(source.info)

@@ -105,14 +105,14 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=150)
     parser.add_argument("--pause", type=float, default=1.0, help="seconds between two questions of a reader")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    walk = WalkSettings(seed=1, frames=words.pictures, size=(240, 180))
+    args = parser.parse_args()
+    walk = WalkSettings(seed=1, frames=args.pictures, size=(240, 180))
     with tempfile.TemporaryDirectory() as scratch:
-        broadcast = Broadcast(film(walk), words.seconds, words.cuts)
-        result = run(broadcast, Path(scratch) / "live.l3r", walk, words.readers, words.pause)
+        broadcast = Broadcast(film(walk), args.seconds, args.cuts)
+        result = run(broadcast, Path(scratch) / "live.l3r", walk, args.readers, args.pause)
     print(machine())
     print(json.dumps(result, indent=1))
-    write_json(words.json, result)
+    write_json(args.json, result)
 
 
 def film(walk: WalkSettings) -> list[bytes]:

@@ -55,11 +55,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--kills", type=int, default=1, help="so many times, evenly spread")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         source, memory = Path(scratch) / "walk", Path(scratch) / "walk.l3r"
-        write_walk(source, words.frames)
-        stops = [words.frames * (k + 1) // (words.kills + 1) for k in range(words.kills)]
+        write_walk(source, args.frames)
+        stops = [args.frames * (k + 1) // (args.kills + 1) for k in range(args.kills)]
         runs = [run(source, memory, stop, resume=k > 0) for k, stop in enumerate([*stops, None])]
         checked = subprocess.run([sys.executable, "-m", "list3r", "verify", str(memory)], check=False).returncode
         with list3r.open(memory) as scene:
@@ -68,10 +68,10 @@ def main() -> None:
                 "chunks": len(scene.store.chunks.all()),
                 "instances": len(scene),
             }
-    found = {"frames": words.frames, "runs": runs, "verify": checked, "memory": held}
+    found = {"frames": args.frames, "runs": runs, "verify": checked, "memory": held}
     print(machine())
     print(json.dumps(found, indent=1))
-    write_json(words.json, found)
+    write_json(args.json, found)
 
 
 def write_walk(root: Path, frames: int) -> None:

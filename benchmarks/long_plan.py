@@ -59,17 +59,17 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--kinds", default="list,video")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
-    for kind in words.kinds.split(","):
+    for kind in args.kinds.split(","):
         with tempfile.TemporaryDirectory() as scratch:
-            source = WRITERS[kind](Path(scratch) / "source", words.frames)
+            source = WRITERS[kind](Path(scratch) / "source", args.frames)
             command = [sys.executable, "-c", MEASURE, str(source), str(Path(scratch) / "memory.l3r")]
             out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         rows.append({"kind": kind, **json.loads(out.splitlines()[-1])})
         print(json.dumps(rows[-1]), flush=True)
     print(machine())
-    write_json(words.json, {"rows": rows})
+    write_json(args.json, {"rows": rows})
 
 
 def write_list(root: Path, frames: int) -> Path:

@@ -110,30 +110,30 @@ def compare_devices(frames: list[Frame], posed: NDArray[np.bool_], T: Poses, cam
     }
 
 
-def run(path: str, options: SourceOptions, words: argparse.Namespace) -> dict[str, Any]:
+def run(path: str, options: SourceOptions, args: argparse.Namespace) -> dict[str, Any]:
     """Measure each run of frames."""
     source = open_source(path, options)
     camera = source.info.camera
     if camera is None:
         raise SystemExit("the intrinsics of the source are unknown; give --intrinsics fx,fy,cx,cy")
-    every = words.depth_every or depth_step(source, words.frames)
+    every = args.depth_every or depth_step(source, args.frames)
     rows = []
-    for start in words.start:
-        span = start, min(start + words.frames * every, source.info.frame_count)
+    for start in args.start:
+        span = start, min(start + args.frames * every, source.info.frame_count)
         frames = [f for f in source.read(*span) if isinstance(f, Frame)]
         begin = time.process_time()
-        if words.poses == "sfm":
+        if args.poses == "sfm":
             deep, made = reconstructed(source, frames, span, camera, every)
             posed, T, used, depth, confidence = made.posed, made.T_chunk_cam, made.camera, made.depth, made.confidence
         else:
             deep, used = frames[::every], camera
-            posed, T = poses_of(deep, camera, words.poses)
+            posed, T = poses_of(deep, camera, args.poses)
             begin = time.process_time()
             depth, confidence = dense_depth(PosedFrames(deep, posed, T, camera))
         spent = time.process_time() - begin
         row = {"start": start, "frames": len(frames), "with_depth": len(deep), "posed": int(posed.sum())}
         row |= {"cpu_s": round(spent, 1), **against_sensor(depth, confidence, deep)}
-        if words.device == "cuda":
+        if args.device == "cuda":
             row["devices"] = compare_devices(deep, posed, T, used)
         print(json.dumps(row), flush=True)
         rows.append(row)
@@ -142,7 +142,7 @@ def run(path: str, options: SourceOptions, words: argparse.Namespace) -> dict[st
         for name in ("coverage", "median_error", "cpu_s")
         if all(name in row for row in rows)
     }
-    return {"source": Path(path).name, "poses": words.poses, "depth_every": every, "mean": mean, "runs": rows}
+    return {"source": Path(path).name, "poses": args.poses, "depth_every": every, "mean": mean, "runs": rows}
 
 
 def main() -> None:

@@ -8,8 +8,8 @@ PYTHONPATH=. python benchmarks/names.py --left-out 5000-5011 --left-out-fitted 5
 Rooms are those of `training/worlds`; `--left-out` ones have kinds, textures and a sensor that training never shows,
 `--odd` ones things without a name. A place is a file of a Gazebo world, or the folder of one. All that is listed and
 no structure is judged: its name is right if the true thing that it fits best by voxels, with an IoU of 0.25, is called
-so; what fits none, or a thing that none of the names goes with, can only be named wrongly. `--fit` prints `NameBelief`
-fitted to what is given, the kinds of rooms weighing the same.
+so; what fits none, or a thing that none of the names goes with, can only be named wrongly. `--fit` prints the
+`NameConfidence` fitted to what is given, the kinds of rooms weighing the same.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from calibration import calibration
 from discovery import seeds_of
 from machine import machine, write_json
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from list3r.evaluation.calibration import calibration
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.belief import NameBelief, NameSigns, name_signs
 from list3r.instances.learned.cut import CutSettings, join_parts
 from list3r.instances.learned.discovery import LearnedSettings
 from list3r.instances.learned.graph import chunk_surface
+from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import first_verdicts, names_of, thing_features
 from list3r.instances.learned.weights import load_weights
@@ -206,7 +206,7 @@ def listed(sample: Sample) -> dict[str, NDArray[Any]]:
 
 def summary(rows: Sequence[Named]) -> dict[str, Any]:
     """What is named and how much of that is right, from several probabilities on, as the judge says and as believed."""
-    belief = NameBelief()
+    belief = NameConfidence()
     nameable = np.concatenate([r.nameable for r in rows])
     out: dict[str, Any] = {"walks": len(rows), "things": len(nameable), "nameable": int(nameable.sum())}
     right = np.concatenate([r.right for r in rows])
@@ -221,7 +221,7 @@ def summary(rows: Sequence[Named]) -> dict[str, Any]:
     return out
 
 
-def fitted(groups: Sequence[Sequence[Named]]) -> NameBelief:
+def fitted(groups: Sequence[Sequence[Named]]) -> NameConfidence:
     """The weights under which what is right is likeliest, each group weighing the same."""
     signs = [r.signs for rows in groups for r in rows]
     x = np.concatenate([np.column_stack([s.odds, s.whole, np.full(len(s.odds), s.others)]) for s in signs])
@@ -237,7 +237,7 @@ def fitted(groups: Sequence[Sequence[Named]]) -> NameBelief:
     w = minimize(loss, np.zeros(x.shape[1] + 1)).x
     each = w[1:] / spread
     odds, whole, others = (round(float(v), 3) for v in each)
-    return NameBelief(odds, whole, others, round(float(w[0] - each @ middle), 2))
+    return NameConfidence(odds, whole, others, round(float(w[0] - each @ middle), 2))
 
 
 if __name__ == "__main__":

@@ -31,14 +31,14 @@ def main() -> None:
     parser.add_argument("--preset", default="opposite", choices=("opposite", "halls", "alike"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
-    words = parser.parse_args()
-    first, last = (int(n) for n in words.seeds.split("-"))
+    args = parser.parse_args()
+    first, last = (int(n) for n in args.seeds.split("-"))
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(first, last + 1):
-            rows.append({"seed": seed, **one_home((words.keep or Path(scratch)) / str(seed), words.preset, seed)})
+            rows.append({"seed": seed, **one_home((args.keep or Path(scratch)) / str(seed), args.preset, seed)})
             print(json.dumps(rows[-1]), flush=True)
-            write_json(words.json, {"preset": words.preset, "homes": rows})
+            write_json(args.json, {"preset": args.preset, "homes": rows})
     print(machine())
 
 

@@ -35,26 +35,26 @@ def main() -> None:
     parser.add_argument("--instances", default="1000,100000")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     parser.add_argument("--picture", type=Path, help="file for a picture of the last page")
-    words = parser.parse_args()
+    args = parser.parse_args()
     from tests.browser import Browser
 
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         page = Browser(Path(folder) / "profile")
         try:
-            for count in (int(n) for n in words.instances.split(",")):
+            for count in (int(n) for n in args.instances.split(",")):
                 memory, report = Path(folder) / f"made-{count}.l3r", Path(folder) / f"{count}.html"
                 exporters.write_memory(memory, count)
                 with list3r.open(memory) as scene:
                     scene.export("report", report)
                 rows.append({"instances": count, "mb": round(report.stat().st_size / 1e6, 1), **measure(page, report)})
                 print(rows[-1], flush=True)
-            if words.picture is not None:
-                Image.fromarray(page.picture()).save(words.picture)
+            if args.picture is not None:
+                Image.fromarray(page.picture()).save(args.picture)
         finally:
             page.close()
     print(machine())
-    write_json(words.json, {"rows": rows})
+    write_json(args.json, {"rows": rows})
 
 
 def measure(page: Browser, report: Path) -> dict[str, Any]:

@@ -55,13 +55,13 @@ def main() -> None:
     parser.add_argument("memories", nargs="+", type=Path)
     parser.add_argument("--no-nvidia", action="store_true", help="without the validators that take environments")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
-    for path in words.memories:
+    for path in args.memories:
         with tempfile.TemporaryDirectory() as folder:
-            rows.append({"memory": path.stem, **examined(path, Path(folder), nvidia=not words.no_nvidia)})
+            rows.append({"memory": path.stem, **examined(path, Path(folder), nvidia=not args.no_nvidia)})
         print(json.dumps(rows[-1]), flush=True)
-    write_json(words.json, {"rows": rows})
+    write_json(args.json, {"rows": rows})
     sys.exit(not all(row["sound"] for row in rows))
 
 

@@ -27,7 +27,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalInstance
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunks.chunk import ChunkTask, process_chunk
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.workers import OrderedPool, default_workers
@@ -39,24 +39,24 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--frames", type=int, help="only the first so many")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
     options, settings = SourceOptions(), BuildSettings("rgbd", keep_pictures=False)
-    source = open_source(words.source, options)
-    count = min(source.info.frame_count, words.frames or source.info.frame_count)
-    tasks = [ChunkTask(str(words.source), options, span, settings) for span in plan_chunks(count, settings.chunks)]
-    with OrderedPool(process_chunk, default_workers()) as pool:
-        results = list(pool.map(tasks))
+    source = open_source(args.source, options)
+    count = min(source.info.frame_count, args.frames or source.info.frame_count)
+    tasks = [ChunkTask(str(args.source), options, span, settings) for span in plan_chunks(count, settings.chunks)]
+    with OrderedPool(process_parts, default_workers()) as pool:
+        results = [parts[-1] for parts in pool.map(tasks)]
     frames = [f for f in source.read(0, count) if isinstance(f, Frame) and f.T_source_cam is not None]
     truth = Trajectory(np.array([f.time_s for f in frames]), np.stack([np.asarray(f.T_source_cam) for f in frames]))
     with threadpool_limits(1):
-        rows = [measure("metric", results, truth, words.source, None)]
-        rows += [measure(f"seed {n}", results, truth, words.source, int(n)) for n in words.seeds.split(",")]
+        rows = [measure("metric", results, truth, args.source, None)]
+        rows += [measure(f"seed {n}", results, truth, args.source, int(n)) for n in args.seeds.split(",")]
     for row in rows:
         row["ratio_to_se3"] = round(row["ate_sim3_m"] / rows[0]["ate_se3_m"], 4)
         row["ratio_to_sim3"] = round(row["ate_sim3_m"] / rows[0]["ate_sim3_m"], 4)
         print("  ".join(f"{k} {v}" for k, v in row.items()))
     print(machine())
-    write_json(words.json, {"source": words.source.name, "frames": count, "runs": rows})
+    write_json(args.json, {"source": args.source.name, "frames": count, "runs": rows})
 
 
 def measure(

@@ -42,13 +42,13 @@ def main() -> None:
     parser.add_argument("--seeds", default="61-80", help="first-last")
     parser.add_argument("--sensor", action="store_true", help="geometry of a depth sensor")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    first, last = (int(n) for n in words.seeds.split("-"))
+    args = parser.parse_args()
+    first, last = (int(n) for n in args.seeds.split("-"))
     pairs: list[dict[str, Any]] = []
     other: Home | None = None
     for seed in range(first, last + 1):
         started = time.process_time()
-        home = Home(words.preset, seed, words.sensor)
+        home = Home(args.preset, seed, args.sensor)
         with tempfile.TemporaryDirectory() as scratch:
             for store, chunk_id, truth, same in home.arrivals(Path(scratch) / "memory.l3r", other):
                 judged = judged_loops(store, chunk_id, truth, same)
@@ -56,7 +56,7 @@ def main() -> None:
         other = home
         found = summary(pairs)
         print(f"seed {seed}: {time.process_time() - started:.1f} s of CPU; so far {found}", flush=True)
-        write_json(words.json, {"preset": words.preset, "sensor": words.sensor, "total": found, "pairs": pairs})
+        write_json(args.json, {"preset": args.preset, "sensor": args.sensor, "total": found, "pairs": pairs})
     print(machine())
 
 

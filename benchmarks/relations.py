@@ -39,7 +39,7 @@ from list3r.instances.neural.candidates import plane_of_mask, without_spill
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunks.chunk import ChunkTask, process_chunk
+from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 from list3r.queries.relations import VERTICAL
@@ -61,11 +61,11 @@ def main() -> None:
     parser.add_argument("--poses", choices=("given", "estimate"), default="estimate")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as scratch, threadpool_limits(1):
-        for seed in (int(word) for word in words.seeds.split(",")):
-            rows.append(measure(seed, words.poses, words.keep or Path(scratch)))
+        for seed in (int(word) for word in args.seeds.split(",")):
+            rows.append(measure(seed, args.poses, args.keep or Path(scratch)))
             print({k: v for k, v in rows[-1].items() if k not in ("wrong", "missed")})
     pooled = {}
     for name in (*PREDICATES, "next_to_decided", "attached_to", *ASKED):
@@ -81,7 +81,7 @@ def main() -> None:
     print(f"vertical relations without gravity: {vertical}")
     things = statistics.fmean(r["things"] for r in rows)
     print(machine())
-    write_json(words.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": things, "seeds": rows})
+    write_json(args.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": things, "seeds": rows})
 
 
 def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str
     told: dict[tuple[int, int], int] = {}
     for span in plan_chunks(source.info.frame_count, settings.chunks):
         discoverer = ToldMasks(walk, truth, settings.instances)
-        result = process_chunk(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)
+        result = process_parts(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)[-1]
         chunk = add_chunk(store, session, result)
         for instance in result.library.instances:
             told[chunk, instance.local_id] = _true_id(walk, instance.track)

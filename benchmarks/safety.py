@@ -297,45 +297,45 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--resume", action="store_true", help="keep the parts that the file holds already")
-    words = parser.parse_args()
+    args = parser.parse_args()
     print(machine())
-    asked = {name: getattr(words, name) for name in ("kills", "minutes", "flips", "lies", "seed")}
+    asked = {name: getattr(args, name) for name in ("kills", "minutes", "flips", "lies", "seed")}
     result: Result = {"asked": asked}
-    if words.resume and words.json is not None and words.json.exists():
-        held = json.loads(words.json.read_text(encoding="utf-8"))
+    if args.resume and args.json is not None and args.json.exists():
+        held = json.loads(args.json.read_text(encoding="utf-8"))
         if held.pop("machine") != machine() or held["asked"] != asked:
-            raise SystemExit(f"{words.json} was measured on another machine or asked for something else")
+            raise SystemExit(f"{args.json} was measured on another machine or asked for something else")
         result = held
     with tempfile.TemporaryDirectory() as name:
-        for key, part in _parts(Path(name), words):
+        for key, part in _parts(Path(name), args):
             if key not in result:
                 result[key] = part()
                 print(key, json.dumps(result[key], indent=2), flush=True)
-                write_json(words.json, result)
+                write_json(args.json, result)
     if any(isinstance(v, dict) and v.get("problems") for v in result.values()):
         raise SystemExit(1)
 
 
-def _parts(folder: Path, words: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Any]]]:
+def _parts(folder: Path, args: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Name of each part and what does it, in order; what several need is made when the first of them does."""
-    seed, runs = words.seed, 3 * words.kills // 10
-    edits, writes = (words.kills - 2 * runs) // 4, (words.kills - 2 * runs) // 4
+    seed, runs = args.seed, 3 * args.kills // 10
+    edits, writes = (args.kills - 2 * runs) // 4, (args.kills - 2 * runs) // 4
     made = _Memories(folder)
     yield "kills while building", lambda: kill_builds(made.first, folder, runs, seed)
     yield "kills while updating", lambda: kill_updates(made.built, made.second, folder, runs, seed + 1)
     for part, kill, count in (
         ("kills while writing", kill_writes, writes),
         ("kills while editing", kill_edits, edits),
-        ("kills of commands that edit", kill_commands, words.kills - 2 * runs - edits - writes),
+        ("kills of commands that edit", kill_commands, args.kills - 2 * runs - edits - writes),
     ):
         # A file of its own for each: what a killed writer left beside one belongs to no other.
         yield part, lambda k=kill, n=count: k(_copy(made.updated, k.__name__), n, seed + 2)
-    yield "flips", lambda: flip(made.built, folder, words.flips, seed)
-    yield "lies", lambda: lying.tell(folder, seed, words.lies)
-    yield "repairs", lambda: repair_flips(made.built, folder, words.flips // 10, seed + 1)
+    yield "flips", lambda: flip(made.built, folder, args.flips, seed)
+    yield "lies", lambda: lying.tell(folder, seed, args.lies)
+    yield "repairs", lambda: repair_flips(made.built, folder, args.flips // 10, seed + 1)
     yield "file_mb", lambda: round(made.built.stat().st_size / 1e6, 2)
     yield "verify_s", lambda: _verify_s(made.built)
-    yield "readers", lambda: write_and_read(_copy(made.built, "read"), 60 * words.minutes)
+    yield "readers", lambda: write_and_read(_copy(made.built, "read"), 60 * args.minutes)
 
 
 class _Memories:

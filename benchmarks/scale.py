@@ -69,23 +69,23 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder in which the memories are kept and taken up again")
     parser.add_argument("--no-database", action="store_true", help="ours and NumPy only")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
-    words = parser.parse_args()
-    if words.one is not None:
-        print(json.dumps(measure(words.one, words.questions, words.seed, words.keep, database=not words.no_database)))
+    args = parser.parse_args()
+    if args.one is not None:
+        print(json.dumps(measure(args.one, args.questions, args.seed, args.keep, database=not args.no_database)))
         return
     print(machine())
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
-        for count in (int(word) for word in words.instances.split(",")):
-            folder = words.keep or Path(scratch)
+        for count in (int(word) for word in args.instances.split(",")):
+            folder = args.keep or Path(scratch)
             command = [sys.executable, __file__, "--one", str(count), "--keep", str(folder)]
-            command += ["--questions", str(words.questions), "--seed", str(words.seed)]
-            command += ["--no-database"] if words.no_database else []
-            cache = {**os.environ, "LIST3R_CACHE": str((words.keep or Path(scratch)) / "cache")}
+            command += ["--questions", str(args.questions), "--seed", str(args.seed)]
+            command += ["--no-database"] if args.no_database else []
+            cache = {**os.environ, "LIST3R_CACHE": str((args.keep or Path(scratch)) / "cache")}
             out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=cache).stdout
             rows.append(json.loads(out.splitlines()[-1]))
             print("\n".join(f"{count:>9,}  {k:34} {v}" for k, v in rows[-1].items()), flush=True)
-            write_json(words.json, {"sizes": rows})
+            write_json(args.json, {"sizes": rows})
 
 
 def measure(count: int, questions: int, seed: int, folder: Path, *, database: bool) -> dict[str, Any]:

@@ -58,15 +58,15 @@ def main() -> None:
     parser.add_argument("--workers", default="1")
     parser.add_argument("--jobs", type=int, default=1, help="how many are measured side by side")
     parser.add_argument("--redkitchen", type=Path, help="the sequence's folder; its two halves become two sessions")
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        root = words.keep or Path(scratch)
-        seeds = [int(word) for word in words.seeds.split(",") if word]
-        runs = [(seed, method) for seed in seeds for method in words.discovery.split(",")]
-        with ThreadPoolExecutor(words.jobs) as pool:
-            table = pool.submit(redkitchen, root, words.redkitchen, words.workers) if words.redkitchen else None
-            homes = pool.map(lambda run: one_home(root / str(run[0]), run[0], words.workers, run[1]), runs)
+        root = args.keep or Path(scratch)
+        seeds = [int(word) for word in args.seeds.split(",") if word]
+        runs = [(seed, method) for seed in seeds for method in args.discovery.split(",")]
+        with ThreadPoolExecutor(args.jobs) as pool:
+            table = pool.submit(redkitchen, root, args.redkitchen, args.workers) if args.redkitchen else None
+            homes = pool.map(lambda run: one_home(root / str(run[0]), run[0], args.workers, run[1]), runs)
             for (seed, method), row in zip(runs, homes, strict=True):
                 rows.append({"seed": seed, "discovery": method or "default", **row})
                 print(json.dumps(rows[-1]), flush=True)
@@ -76,7 +76,7 @@ def main() -> None:
     result |= {"redkitchen": halves} if halves else {}
     print(machine())
     print(json.dumps({k: v for k, v in result.items() if k != "seeds"}, indent=1))
-    write_json(words.json, result)
+    write_json(args.json, result)
 
 
 def one_home(root: Path, seed: int, workers: str, discovery: str = "") -> dict[str, Any]:

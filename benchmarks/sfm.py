@@ -43,24 +43,24 @@ def main() -> None:
     parser.add_argument("--no-plain", action="store_true", help="leave plain pycolmap out")
     parser.add_argument("--keep", type=Path, help="where to keep the memory")
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    truth, names = read_truth(words.source, words.frames)
+    args = parser.parse_args()
+    truth, names = read_truth(args.source, args.frames)
     with tempfile.TemporaryDirectory() as scratch:
         folder = colour_only(Path(scratch) / "colour", names)
-        given = folder if words.given_as == "folder" else _video(folder, Path(scratch), words.given_as)
+        given = folder if args.given_as == "folder" else _video(folder, Path(scratch), args.given_as)
         ours = {
-            "given_as": words.given_as,
-            **built(given, words.keep or Path(scratch) / "memory.l3r", _options(words), truth),
+            "given_as": args.given_as,
+            **built(given, args.keep or Path(scratch) / "memory.l3r", _options(args), truth),
         }
         print(ours)
-        if words.no_plain:
-            write_json(words.json, {"source": words.source.name, "list3r": ours})
+        if args.no_plain:
+            write_json(args.json, {"source": args.source.name, "list3r": ours})
             return
-        plain = plain_pycolmap(folder, Path(scratch), words.intrinsics, truth, words.plain_every)
+        plain = plain_pycolmap(folder, Path(scratch), args.intrinsics, truth, args.plain_every)
         print(plain)
     ratio = ours["ate_sim3_m"] / plain["ate_sim3_m"] if plain["posed"] else float("nan")
     print(f"ATE ours by plain {ratio:.3f}", machine())
-    write_json(words.json, {"source": words.source.name, "list3r": ours, "pycolmap": plain, "ratio": round(ratio, 4)})
+    write_json(args.json, {"source": args.source.name, "list3r": ours, "pycolmap": plain, "ratio": round(ratio, 4)})
 
 
 def read_truth(source: Path, count: int | None) -> tuple[Trajectory, list[Path]]:
@@ -111,10 +111,10 @@ def _video(folder: Path, scratch: Path, kind: str) -> Path:
     return path
 
 
-def _options(words: argparse.Namespace) -> list[str]:
-    options = ["--workers", str(words.workers)]
-    options += ["--intrinsics", words.intrinsics] if words.intrinsics else []
-    return options + (["--every", str(words.every)] if words.every else [])
+def _options(args: argparse.Namespace) -> list[str]:
+    options = ["--workers", str(args.workers)]
+    options += ["--intrinsics", args.intrinsics] if args.intrinsics else []
+    return options + (["--every", str(args.every)] if args.every else [])
 
 
 def built(folder: Path, memory: Path, options: list[str], truth: Trajectory) -> dict[str, Any]:

@@ -19,11 +19,11 @@ def main() -> None:
     parser.add_argument("--seeds", default="11,12,13,14")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--keep", type=Path, help="folder in which walks and memories are kept")
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
-        root = words.keep or Path(scratch)
-        for seed in (int(word) for word in words.seeds.split(",")):
+        root = args.keep or Path(scratch)
+        for seed in (int(word) for word in args.seeds.split(",")):
             answer, usage = run_list3r("demo", "--out", str(root / f"seed-{seed}"), "--seed", str(seed))
             rows.append({"seed": seed, **usage, **flat(answer["scores"])})
             print("  ".join(f"{k} {v}" for k, v in rows[-1].items()))
@@ -33,7 +33,7 @@ def main() -> None:
     print(machine())
     for key, value in mean.items():
         print(f"{key:28} {value}")
-    write_json(words.json, {"mean": mean, "seeds": rows})
+    write_json(args.json, {"mean": mean, "seeds": rows})
 
 
 def flat(scores: dict[str, Any]) -> dict[str, Any]:

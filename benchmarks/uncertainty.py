@@ -34,10 +34,10 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2,3,4")
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--json", type=Path)
-    words = parser.parse_args()
-    jobs = [(p, int(s)) for s in words.seeds.split(",") for p in words.presets.split(",")]
+    args = parser.parse_args()
+    jobs = [(p, int(s)) for s in args.seeds.split(",") for p in args.presets.split(",")]
     videos: list[dict[str, Any]] = []
-    with OrderedPool(run_video, words.workers) as pool:
+    with OrderedPool(run_video, args.workers) as pool:
         for row in pool.map(jobs):
             videos.append(row)
             figures = ("inside_share", "median_error_m", "median_stated_m", "ate_sim3_m")
@@ -50,7 +50,7 @@ def main() -> None:
     for name, entry in summary.items():
         print(f"{name:9} " + "  ".join(f"{k} {v}" for k, v in entry.items()))
     print(machine())
-    write_json(words.json, {"summary": summary, "videos": videos})
+    write_json(args.json, {"summary": summary, "videos": videos})
 
 
 def run_video(job: tuple[str, int]) -> dict[str, Any]:

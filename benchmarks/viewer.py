@@ -43,15 +43,15 @@ def main() -> None:
     parser.add_argument("--things", type=int, default=2_000)
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     parser.add_argument("--picture", type=Path, help="file for a picture of the page")
-    words = parser.parse_args()
+    args = parser.parse_args()
     from list3r.viewer.app import Viewer, ViewerSettings
     from tests.browser import Browser
 
-    exporters.POINTS = words.points // words.things
+    exporters.POINTS = args.points // args.things
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.l3r"
-        exporters.write_memory(path, words.things)
-        told = {"points": words.points, "instances": words.things, "file_mb": round(path.stat().st_size / 1e6, 1)}
+        exporters.write_memory(path, args.things)
+        told = {"points": args.points, "instances": args.things, "file_mb": round(path.stat().st_size / 1e6, 1)}
         with list3r.open(path) as memory:
             began = time.process_time()
             viewer = Viewer(memory, ViewerSettings(0))
@@ -59,12 +59,12 @@ def main() -> None:
             told["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
             page = Browser(Path(folder) / "profile")
             try:
-                told |= measure(page, viewer, words.picture)
+                told |= measure(page, viewer, args.picture)
             finally:
                 page.close()
                 viewer.stop()
     print(told)
-    write_json(words.json, told)
+    write_json(args.json, told)
 
 
 def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, Any]:

@@ -28,15 +28,15 @@ def main() -> None:
     parser.add_argument("--words", type=int, default=64)
     parser.add_argument("--axes", type=int, default=31)
     parser.add_argument("--every", type=int, default=90, help="frames between pictures")
-    words = parser.parse_args()
-    x = root_sift(np.concatenate([descriptors(*video, words.every) for video in VIDEOS]))
+    args = parser.parse_args()
+    x = root_sift(np.concatenate([descriptors(*video, args.every) for video in VIDEOS]))
     mean = x.mean(axis=0)
-    axes = np.linalg.svd((x - mean)[::5], full_matrices=False)[2][: words.axes].T
-    kmeans = faiss.Kmeans(words.axes, words.words, niter=20, seed=1)
+    axes = np.linalg.svd((x - mean)[::5], full_matrices=False)[2][: args.axes].T
+    kmeans = faiss.Kmeans(args.axes, args.words, niter=20, seed=1)
     kmeans.train(np.ascontiguousarray((x - mean) @ axes, np.float32))
     half = {"mean": mean, "axes": axes, "words": kmeans.centroids}
-    np.savez_compressed(words.out, **{name: value.astype(np.float16) for name, value in half.items()})
-    print(f"{words.words} words of {len(x)} descriptors: {words.out}")
+    np.savez_compressed(args.out, **{name: value.astype(np.float16) for name, value in half.items()})
+    print(f"{args.words} args of {len(x)} descriptors: {args.out}")
 
 
 def descriptors(preset: str, seed: int, every: int) -> np.ndarray:

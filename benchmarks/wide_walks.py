@@ -34,48 +34,48 @@ REAL_INTRINSICS = "525,525,320,240"
 """Of the colour camera of 7-Scenes."""
 
 
-def compare_walks(words: argparse.Namespace) -> None:
+def compare_walks(args: argparse.Namespace) -> None:
     """Film, build and compare the walks of some seeds, and a real one."""
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        root = words.keep or Path(scratch)
-        for seed in [int(word) for word in words.seeds.split(",") if word]:
+        root = args.keep or Path(scratch)
+        for seed in [int(word) for word in args.seeds.split(",") if word]:
             walk = WideStepWalk(
-                seed=seed, frames=words.frames, size=SIZE, step_m=words.step, **(HARD if words.hard else {})
+                seed=seed, frames=args.frames, size=SIZE, step_m=args.step, **(HARD if args.hard else {})
             )
-            folder = root / f"{'hard' if words.hard else 'wide'}-{seed}-{words.frames}"
-            rows.append({"walk": f"seed {seed}", **_simulated(folder, walk, words)})
-            _tell(rows, words)
-        if words.real is not None:
-            rows.append({"walk": f"{words.real.name}, every {REAL_EVERY}th", **_real(root / "wide-real", words)})
-            _tell(rows, words)
+            folder = root / f"{'hard' if args.hard else 'wide'}-{seed}-{args.frames}"
+            rows.append({"walk": f"seed {seed}", **_simulated(folder, walk, args)})
+            _tell(rows, args)
+        if args.real is not None:
+            rows.append({"walk": f"{args.real.name}, every {REAL_EVERY}th", **_real(root / "wide-real", args)})
+            _tell(rows, args)
     print(machine())
 
 
-def _tell(rows: list[dict[str, Any]], words: argparse.Namespace) -> None:
+def _tell(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
     print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-    said = {"step_m": words.step, "hard": words.hard, "frames": words.frames, "size": SIZE}
-    write_json(words.json, {**said, "walks": rows})
+    said = {"step_m": args.step, "hard": args.hard, "frames": args.frames, "size": SIZE}
+    write_json(args.json, {**said, "walks": rows})
 
 
-def _simulated(folder: Path, walk: WideStepWalk, words: argparse.Namespace) -> dict[str, Any]:
+def _simulated(folder: Path, walk: WideStepWalk, args: argparse.Namespace) -> dict[str, Any]:
     if not (folder / "walk" / "truth.json").exists():
-        write_walk(folder / "walk", walk, words.workers)
+        write_walk(folder / "walk", walk, args.workers)
     poses = read_tum(folder / "walk" / "groundtruth.txt").T_world_cam
     camera = walk.camera()
     intrinsics = ",".join(f"{v:g}" for v in (camera.fx, camera.fy, camera.cx, camera.cy))
-    return _compared(folder, sorted((folder / "walk" / "rgb").iterdir()), poses, intrinsics, words)
+    return _compared(folder, sorted((folder / "walk" / "rgb").iterdir()), poses, intrinsics, args)
 
 
-def _real(folder: Path, words: argparse.Namespace) -> dict[str, Any]:
-    truth, names = read_truth(words.real, None)
+def _real(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    truth, names = read_truth(args.real, None)
     assert len(names) == len(truth.time_s), "every picture needs a pose"
     kept = slice(None, None, REAL_EVERY)
-    return _compared(folder, names[kept], truth.T_world_cam[kept], REAL_INTRINSICS, words)
+    return _compared(folder, names[kept], truth.T_world_cam[kept], REAL_INTRINSICS, args)
 
 
 def _compared(
-    folder: Path, names: list[Path], T_world_cam: Any, intrinsics: str, words: argparse.Namespace
+    folder: Path, names: list[Path], T_world_cam: Any, intrinsics: str, args: argparse.Namespace
 ) -> dict[str, Any]:
     """The figures of both programs on the same pictures, in order, with their true poses (F, 4, 4)."""
     truth = Trajectory(np.arange(len(names)) / 30.0, T_world_cam)
@@ -84,7 +84,7 @@ def _compared(
         pictures = colour_only(Path(scratch) / "colour", names)
         memory = folder / "memory.l3r"
         folder.mkdir(parents=True, exist_ok=True)
-        options = ["--force", "--workers", str(words.workers), "--intrinsics", intrinsics]
+        options = ["--force", "--workers", str(args.workers), "--intrinsics", intrinsics]
         plain = _noted(folder / "plain.json", lambda: plain_pycolmap(pictures, Path(scratch), intrinsics, truth))
         ours = _noted(folder / f"ours-{STARTED_AT}.json", lambda: built(pictures, memory, options, truth))
     ours["cpu_s_a_frame"] = round(ours["cpu_s"] / len(names), 3)

@@ -1,6 +1,6 @@
-"""The face of a memory for Python: opening, asking, exporting.
+"""The Python interface of a memory: open, build, ask, edit, export.
 
-What answers a question is imported when it is asked, so that a short one starts soon.
+The module of a question is imported when it is asked, so that simple questions start fast.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from list3r.frames.options import SourceOptions
     from list3r.memory.geometry import Sim3
     from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
-    from list3r.pipeline.request import BuildRequest, RunWords
+    from list3r.pipeline.request import BuildRequest, RunArguments
     from list3r.pipeline.settings import BuildSettings
     from list3r.queries.changes import Changed
     from list3r.queries.find import Found
@@ -49,11 +49,11 @@ R = TypeVar("R")
 
 
 def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concatenate[SceneMemory, P], R]:
-    """One thread at a time: the file's connection and what is kept for the next question are shared by all of them."""
+    """Let one thread in at a time: all threads share the file's connection and its caches."""
 
     @functools.wraps(method)
     def guarded(self: SceneMemory, /, *args: P.args, **kwargs: P.kwargs) -> R:
-        # Of what another process writes meanwhile an answer must see one state; a writer has no other beside it.
+        # An answer must see one state while another process writes; a writer has none beside it.
         with naming_extras(), self._lock, nullcontext() if self.store.writable else self.store.snapshot():
             return method(self, *args, **kwargs)
 
@@ -63,13 +63,13 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
 def open(
     path: str | Path, *, writable: bool = False, at: int | None = None, min_confidence: float | None = None
 ) -> SceneMemory:
-    """Open a memory, for reading or for editing too. Raises `MemoryFileError` for anything that is not one.
+    """Open a memory for reading, or with `writable` also for editing. Raises `MemoryFileError` for other files.
 
-    Many may read while one writes; a second writer is refused. With `at` every question is about the world as it was
-    after that session, and nothing can be written; `OptionError` for a session that there is not.
+    Many can read while one writes; a second writer is refused. With `at` every question is about the world as it was
+    after that session, and nothing can be written. Raises `OptionError` for an unknown session.
 
-    With `min_confidence` every question is about all that is at least so sure to be one thing, also what is too unsure
-    to be listed (scraps); nothing can be written then, and with `at` no scraps are shown.
+    With `min_confidence` every question is about all instances with at least that confidence, also scraps, which are
+    not listed otherwise. Nothing can be written then, and with `at` there are no scraps.
 
     >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
     >>> list3r.open("house.l3r", min_confidence=0.2).instances()
@@ -98,17 +98,17 @@ def build(
     *,
     options: SourceOptions | None = None,
     settings: BuildSettings | BuildRequest | None = None,
-    **run: Unpack[RunWords],
+    **run: Unpack[RunArguments],
 ) -> SceneMemory:
-    """Build the memory of a video or folder and open it; of a webcam or stream until it ends.
+    """Build the memory of a video or folder, or of a webcam or stream until it ends, and open it.
 
-    `options` says what is known of the source (intrinsics, depth scale, ...). `settings` says how it is worked on: a
-    `BuildRequest` names models or a preset and leaves the rest to the machine, `BuildSettings` decides all.
+    `options` describes the source (intrinsics, depth scale, ...). `settings` says how it is processed: a `BuildRequest`
+    names models or a preset and leaves the rest to the machine, `BuildSettings` decides everything.
 
-    Further arguments: `workers`, processes; `engine`, "ray" for the machines of a cluster at an `address`; `resume`
-    goes on with a build that was interrupted; `force` replaces an existing memory. `licence` is what networks may be
-    under: permissive (any use, no account), research (non-commercial, gated and own terms too) or any. `scale_anchor`
-    is a length that is known, `detector` (with `detector_classes`) the file of a box detector that names things.
+    Further arguments: `workers`, the number of processes; `engine`, "ray" for a cluster at an `address`; `resume`
+    continues a build that was interrupted; `force` replaces an existing memory. `licence` names the
+    licences that networks may have: permissive (any use, no account), research (also non-commercial, gated and custom
+    ones) or any. `scale_anchor` is a known length, `detector` (with `detector_classes`) the file of a box detector.
     Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`, each with the way to mend it.
 
         >>> list3r.build("walk/", "house.l3r", settings=list3r.BuildRequest(preset="light"), workers=2)
@@ -126,12 +126,12 @@ def update(
     *,
     options: SourceOptions | None = None,
     settings: BuildSettings | BuildRequest | None = None,
-    **run: Unpack[RunWords],
+    **run: Unpack[RunArguments],
 ) -> SceneMemory:
-    """Add one more video to a memory and open it; `SceneMemory.changes` then says what was moved, removed and added.
+    """Add a later video to a memory and open it; `SceneMemory.changes` then lists what was moved, removed and added.
 
     The arguments are those of `build`; `force` gives up an update that was interrupted. A video in which no stored
-    place is recognised is kept apart, in a component of its own. Raises `SourceError`, `OptionError`,
+    place is recognised becomes a connected component of its own. Raises `SourceError`, `OptionError`,
     `TrackingError` or `MemoryFileError`, each with the way to mend it.
     """
     from list3r.pipeline import update as updating
@@ -142,10 +142,10 @@ def update(
 
 
 class SceneMemory(MemoryEdits):
-    """A memory that is open; use it as a context manager or call `close`.
+    """An open memory. Use it as a context manager, or call `close`.
 
-    No question writes to the file. Several threads may ask one `SceneMemory`: their questions take turns. For questions
-    side by side open the file once in each thread or process; a writer does not disturb them.
+    No question writes to the file. Several threads can share a `SceneMemory`; their questions take turns. To ask in
+    parallel open the file once in each thread or process. A writer does not disturb readers.
     """
 
     def __init__(self, store: Store) -> None:
@@ -177,13 +177,13 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def info(self) -> dict[str, Any]:
-        """What the memory is, as plain values: sessions, frames, scale, gravity, counts. As `list3r info --json`."""
+        """Return sessions, frames, scale, gravity and counts as plain values, like `list3r info --json`."""
         from list3r.queries.info import info
 
         return info(self.store)
 
     def _repr_png_(self) -> bytes:
-        """The plan, for notebooks."""
+        """Return the plan, for notebooks."""
         with tempfile.TemporaryDirectory() as folder:
             return self.export("plan", Path(folder) / "plan.png")[0].read_bytes()
 
@@ -211,36 +211,29 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def instances(self, *, structure: bool | None = False) -> list[Instance]:
-        """All things by id; the structure of the room with `structure=True`, both with None."""
+        """Return the things by id; with `structure=True` the structure of the room, with None both."""
         return self.store.instances.all(structure=structure)
 
     @_alone
-    def instances_at(self, session_id: int) -> list[Instance]:
-        """All things, structure too, as they were after a session. Raises `OptionError` for one that there is not."""
-        from list3r.memory.maintenance.history import world_at
-
-        return world_at(self.store, session_id)
-
-    @_alone
     def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> list[Changed]:
-        """What was moved, removed and added in the sessions after `since`, the newest session first."""
+        """Return what was moved, removed and added in the sessions after `since`, the newest session first."""
         from list3r.queries.changes import changes
 
         return changes(self.store, since, min_confidence=min_confidence)
 
     @_alone
     def instance(self, instance_id: int) -> Instance:
-        """One instance, by its id or by any id it ever had. Raises `UnknownIdError`."""
+        """Return an instance by its id, or by any id it ever had. Raises `UnknownIdError`."""
         return self.store.instances.get(instance_id)
 
     @_alone
     def support(self, instance_id: int) -> Support:
-        """Surface points of an instance, world coordinates."""
+        """Return the surface points of an instance, world coordinates."""
         return self.store.surfaces.of(instance_id)
 
     @_alone
     def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where a moving (`dynamic`) instance was: seconds (V,) and places in the world (V, 3); nothing for others."""
+        """Return the path of a `dynamic` instance: seconds (V,) and world positions (V, 3); V = 0 for others."""
         return self.store.tracks.of(instance_id)
 
     @_alone
@@ -252,7 +245,7 @@ class SceneMemory(MemoryEdits):
         max_distance: float | None = None,
         **filters: Unpack[FilterOptions],
     ) -> Matches:
-        """The k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
+        """Return the k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
 
         Distances are between surfaces and between centres. For the filters (`structure`, `min_confidence`, `state`,
         `label`, `color`, `min_size`, `max_size`, `component`, `dynamic`) see `list3r.queries.match.Filters`.
@@ -281,9 +274,9 @@ class SceneMemory(MemoryEdits):
         occlusion: bool = True,
         **filters: Unpack[FilterOptions],
     ) -> list[Match]:
-        """Things in a box (`lower`, `upper`), a sphere (`center`, `radius`) or the frustum of a `camera`.
+        """Return the things in a box (`lower`, `upper`), a sphere (`center`, `radius`) or the frustum of a `camera`.
 
-        A camera comes from `memory.camera(...)`; what other things hide from it is left out unless `occlusion` is off.
+        `memory.camera(...)` makes a camera. What other things hide from it is left out, unless `occlusion` is off.
 
             >>> memory.within(camera=memory.camera(frame=120), max_depth=3.0)
         """
@@ -310,7 +303,7 @@ class SceneMemory(MemoryEdits):
         space: str | None = None,
         **filters: Unpack[FilterOptions],
     ) -> list[Match]:
-        """The things that look most like an instance (its id), or like a vector of a named embedding space."""
+        """Return the things that look most like an instance (its id), or like a vector of a named embedding space."""
         from list3r.queries.similar import similar
 
         if isinstance(target, int | np.integer):
@@ -326,9 +319,9 @@ class SceneMemory(MemoryEdits):
         box_xyxy: tuple[float, float, float, float] | None = None,
         **filters: Unpack[FilterOptions],
     ) -> list[Match]:
-        """The things that look most like a picture (a file, or RGB of shape (H, W, 3)), or like what is in its box.
+        """Return the things that look most like a picture (a file, or RGB of shape (H, W, 3)), or like a box of it.
 
-        By the model that `list3r embed` was run with; by colours alone where it was not: the reason says which.
+        Compared by the model of `list3r embed`, or by colours alone if it was not run. The reason says which.
 
             >>> memory.similar_to_picture("mug.jpg", box_xyxy=(120, 80, 180, 150))
         """
@@ -342,12 +335,12 @@ class SceneMemory(MemoryEdits):
     def find(
         self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
     ) -> Found:
-        """The things that a text describes, the best first; nothing where nothing fits, with `notes` that say why.
+        """Return the things that a text describes, the best first. If nothing fits, `notes` say why.
 
-        Words are matched with labels, descriptions, colours and sizes; an id may stand for a thing. Left, right, front
-        and behind are told from `viewpoint`, else as in the picture that shows the other thing best. An `encoder` of
-        an embedding space that the memory holds stands in where no thing bears a word; without one, the model that
-        `list3r embed` used.
+        Words are matched with labels, descriptions, colours and sizes; an id can stand for a thing. Left, right, front
+        and behind are as seen from `viewpoint`, or as in the picture that shows the other thing best. Words that
+        describe no thing are compared by an `encoder` of an embedding space of the memory, by default the model of
+        `list3r embed`.
 
             >>> memory.find("white mug on table")
             >>> memory.find("the biggest red thing near the door", k=1)
@@ -357,14 +350,14 @@ class SceneMemory(MemoryEdits):
         return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self.word_encoder())
 
     def word_encoder(self) -> WordEncoder | None:
-        """What compares free words, where the memory was embedded by a text and image model."""
-        from list3r.semantics.embedding import stored_words
+        """Return the model that compares free words, or None if the memory was not embedded by a text-image model."""
+        from list3r.semantics.embedding import stored_text_model
 
-        return stored_words(self.store)
+        return stored_text_model(self.store)
 
     @_alone
     def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
-        """When and in which frames an instance was seen; stretches with breaks of at most `gap_s` count as one."""
+        """Return when and in which frames an instance was seen. Breaks of at most `gap_s` do not end a stretch."""
         from list3r.queries.seen import seen
 
         return seen(self.store, instance_id, gap_s=gap_s)
@@ -378,7 +371,7 @@ class SceneMemory(MemoryEdits):
         max_depth: float | None = None,
         **filters: Unpack[FilterOptions],
     ) -> list[Match]:
-        """What a camera sees: all of which at least a share of `min_visible` is not hidden by other things.
+        """Return what a camera sees: things of which other things leave at least a share of `min_visible` unhidden.
 
         >>> memory.visible(memory.camera(time_s=12.5))
         """
@@ -396,7 +389,7 @@ class SceneMemory(MemoryEdits):
         quat_wxyz: ArrayLike | None = None,
         session: int | None = None,
     ) -> PosedCamera:
-        """The camera of a posed `frame`, of the posed frame nearest to `time_s`, or one put at a pose.
+        """Return the camera of a posed `frame`, of the posed frame nearest to `time_s`, or at a given pose.
 
         A pose is a `position` in the world and the rotation R_world_cam (OpenCV axes) as a quaternion w, x, y, z.
         Raises `OptionError` unless one of the three is given.
@@ -405,9 +398,7 @@ class SceneMemory(MemoryEdits):
 
         posed = position is not None and quat_wxyz is not None
         if (frame is not None) + (time_s is not None) + posed != 1 or (position is None) != (quat_wxyz is None):
-            raise OptionError(
-                "name a camera by its frame, by a time, or by a position with a quaternion: one of the three"
-            )
+            raise OptionError("give one of frame, time, or position with quaternion to name a camera")
         if frame is not None:
             return camera_of_frame(self.store, frame, session)
         if time_s is not None:
@@ -426,10 +417,10 @@ class SceneMemory(MemoryEdits):
         viewpoint: Place | None = None,
         other: int | str | None = None,
     ) -> Relations:
-        """Relations that match what is given (ids or words); `state` is unknown where the memory cannot tell.
+        """Return the relations that match what is given (ids or words); `state` is unknown if the memory cannot decide.
 
-        With `viewpoint` (an id, "camera", "camera:FRAME" or a point) also left_of, right_of, in_front_of and behind;
-        `between` with `object` and `other`. Raises `OptionError` for a predicate that there is not.
+        left_of, right_of, in_front_of and behind need a `viewpoint` (an id, "camera", "camera:FRAME" or a point);
+        `between` needs `object` and `other`. Raises `OptionError` for an unknown predicate.
 
             >>> memory.relations(predicate="left_of", object=4, viewpoint=(0.0, 0.0, 1.5))
             >>> memory.relations(predicate="between", object=4, other=7)
@@ -440,28 +431,28 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def relations_of(self, instance_id: int) -> list[Relation]:
-        """The stored relations of an instance, each told once: not that it supports what is said to be on it."""
+        """Return the stored relations of an instance, each once: `on`, but not its inverse `supports`."""
         from list3r.queries.relations import relations_of
 
         return relations_of(self.store, self.store.instances.get(instance_id).id)
 
     @_alone
     def measure(self, a: int, b: int) -> InstanceDistance:
-        """How far two instances are apart, between surfaces and centres. Raises `UnknownIdError` and `OptionError`."""
+        """Return the distances of surfaces and of centres. Raises `UnknownIdError` and `OptionError`."""
         from list3r.queries.measure import measure
 
         return measure(self.store, a, b)
 
     @_alone
     def path_between(self, start: int, end: int, *, structure: bool = True) -> Relations:
-        """The fewest relations that lead from one instance to another; not over floor and walls without `structure`."""
+        """Return the shortest chain of relations between two instances, with `structure` also over floor and walls."""
         from list3r.queries.path import path
 
         return path(self.store, start, end, structure=structure)
 
     @_alone
     def to_records(self, table: Table = "instances") -> list[dict[str, Value]]:
-        """The instances, relations or frames as flat dicts: what `pandas.DataFrame` and its like take as they are.
+        """Return the instances, relations or frames as flat dicts, as `pandas.DataFrame` takes them.
 
         >>> pandas.DataFrame(memory.to_records()).set_index("id")
         """
@@ -471,24 +462,26 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def sessions(self) -> list[Session]:
-        """The videos that the memory was made from, in order."""
+        """Return the videos that the memory was made from, in order."""
         return self.store.sessions.all()
 
     @_alone
     def camera_poses(self, session: int | None = None) -> list[tuple[FrameRow, Sim3]]:
-        """Every posed frame in order, of one session or of all, with its `S_world_cam`."""
+        """Return every posed frame in order, of one session or of all, with its `S_world_cam`."""
         return self.store.trajectory.poses(session)
 
     @_alone
     def pictures(self, instance_ids: Sequence[int] | None = None) -> list[KeyframePicture]:
-        """The keyframes whose picture is stored, with what shows in each; only those of some instances where asked."""
+        """Return the keyframes with a stored picture, and the instances in each; or only those of some instances."""
         from list3r.queries.pictures import keyframe_pictures
 
         return keyframe_pictures(self.store, instance_ids)
 
     @_alone
     def picture(self, instance_id: int) -> InstancePicture:
-        """The stored picture that shows an instance best, with its mask. Raises `UnknownIdError` and `OptionError`.
+        """Return the stored picture that shows an instance best, with its mask.
+
+        Raises `UnknownIdError` and `OptionError`.
 
         >>> Image.fromarray(memory.picture(12).crop()).save("mug.png")
         """
@@ -498,16 +491,16 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def pixels(self, picture: KeyframePicture) -> NDArray[np.uint8]:
-        """The pixels of one of `pictures()`, RGB. Shape (H, W, 3)."""
+        """Return the pixels of one of `pictures()`, RGB. Shape (H, W, 3)."""
         from list3r.queries.pictures import keyframe_rgb
 
         return keyframe_rgb(self.store, picture)
 
     def prompt(self, tokens: int = 2000, question: str | None = None) -> ScenePrompt:
-        """The memory as text for a language model, of at most so many tokens; `str` of it is the text.
+        """Return the memory as text for a language model, of at most so many tokens; `str` of it is the text.
 
-        With a `question` the things that its words name come first, then what is nearest to them. Tokens are counted
-        by `list3r.exporters.prompt.tokens.count_tokens`. Raises `OptionError` where they do not even hold the head.
+        With a `question` the things that its words name come first, then the things nearest to them. Tokens are counted
+        by `list3r.exporters.prompt.tokens.count_tokens`. Raises `OptionError` if they do not suffice for the head.
 
         >>> print(memory.prompt(1000, "what is on the table?"))
         """
@@ -517,14 +510,14 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def relation_graph(self) -> networkx.MultiDiGraph:
-        """Instances and relations as a graph."""
+        """Return instances and relations as a graph."""
         from list3r.memory.search.graphs import relation_graph
 
         return relation_graph(self.store)
 
     @_alone
     def merge_graph(self) -> networkx.Graph:
-        """Local instances, and the decisions that joined them, as a graph."""
+        """Return local instances, and the decisions that joined them, as a graph."""
         from list3r.memory.search.graphs import merge_graph
 
         return merge_graph(self.store)
@@ -533,7 +526,7 @@ class SceneMemory(MemoryEdits):
     def export(self, format: str, path: str | Path, **options: Unpack[ExportOptions]) -> tuple[Path, ...]:
         """Write the memory in one of `list3r.exporters.registry.FORMATS`. Raises `OptionError` and `ExportError`.
 
-        Returns the files written: `path`, and more beside it where parts of the memory could not be joined. `colmap`,
+        Returns the files written: `path`, and more beside it if the memory has several connected components. `colmap`,
         `nerfstudio` and `prompt` are folders. `color` of ply and glb is rgb or instance; `tokens` and `question` of
         prompt are those of `prompt()`.
 

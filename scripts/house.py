@@ -3,18 +3,43 @@
     python scripts/house.py                     # of this checkout
     python scripts/house.py OTHER [OTHER ...]   # of other checkouts beside it, one column each
 
-Printed as a table of Markdown; docs/design.md holds it before and after the redesign of the rooms.
+Printed as a table of Markdown; docs/design.md holds it before and after the redesign of the rooms. Lines are also
+counted room by room: those that stood at the redesign, and the wings that were built since (`WINGS`).
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import io
+import tokenize
 from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 PACKAGE = "list3r"
 Function = ast.FunctionDef | ast.AsyncFunctionDef
+WINGS = {
+    "adapters, readers and importers": (
+        *("frames/readers", "frames/recordings", "frames/writers", "frames/live", "importers", "instances/neural"),
+        *("reconstruction/networks", "reconstruction/feedforward", "reconstruction/outputs"),
+        *("reconstruction/precomputed.py", "reconstruction/precomputed_files.py", "pipeline/live.py"),
+    ),
+    "viewer, agents, service, catalogue, batches": (
+        *("viewer", "server", "service", "catalog", "batch", "cli/serve", "cli/catalog", "cli/build/batch.py"),
+        *("pipeline/workers/cluster.py", "pipeline/workers/ray_pool.py"),
+    ),
+    "learned discovery, registration by things, one map of a video": (
+        *("instances/learned", "association/revisits/constellations", "association/revisits/whole_chunks"),
+        *("association/whole_map", "pipeline/chunks/whole_map.py"),
+    ),
+    "exporters of other programs": (
+        *("exporters/cameras", "exporters/meshes", "exporters/prompt", "exporters/report", "exporters/simready"),
+        *("exporters/usd", "exporters/parquet.py"),
+    ),
+}
+"""Folders and files of the package that other issues than the redesign added, by what they are."""
 BLOCKS = (ast.If, ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Try, ast.Match)
 
 
@@ -29,12 +54,14 @@ def measure(root: Path) -> dict[str, str]:
     folders = Counter(path.parent for path in trees if path.name != "__init__.py")
     settings = {n.name: n for found in classes.values() for n in found if n.name.endswith("Settings")}
     reached = _reached("BuildSettings", settings)
-    constants = sum(len(_constants(tree)) for tree in trees.values())
+    constants = [n for tree in trees.values() for n in _constants(tree)]
+    counted = {path: _count(path, tree) for path, tree in trees.items()}
     fullest, most = max(folders.items(), key=lambda item: item[1])
     return {
-        "lines": str(sum(path.read_text(encoding="utf-8").count("\n") for path in trees)),
+        "lines": _told(counted.values()),
+        **{f"lines, {name}": _told(found) for name, found in _by_room(counted, package).items()},
         "files": str(len(trees)),
-        "largest file, lines": str(max(path.read_text(encoding="utf-8").count("\n") for path in trees)),
+        "largest file, lines": str(max(lines.all for lines in counted.values())),
         "files in the fullest folder (without `__init__`)": f"{most} (`{fullest.relative_to(root)}`)",
         "folders above 15 files": str(sum(n > 15 for n in folders.values())),
         "layers of files in `memory/`": str(_layers(trees, package)),
@@ -42,12 +69,49 @@ def measure(root: Path) -> dict[str, str]:
         "function length, median / p95": f"{lengths[len(lengths) // 2]} / {lengths[int(0.95 * len(lengths))]}",
         "functions over 6 parameters": str(sum(_parameters(node) > 6 for node in functions)),
         "functions nested four deep": str(sum(_depth(node) >= 4 for node in functions)),
-        "constants of modules": str(constants),
+        "constants of modules, numbers among them": f"{len(constants)}, {sum(map(_is_number, constants))}",
         "inline floats other than 0, 1, 2, 0.5": str(sum(_floats(tree) for tree in trees.values())),
         "settings classes, reachable from `BuildSettings`": f"{len(settings)}, {len(reached)}",
         "class names that stand twice": str(sum(n > 1 for n in names.values())),
         "module-level caches": str(sum(_caches(tree) for tree in trees.values())),
     }
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines of a file."""
+
+    all: int
+    code: int
+    docstrings: int
+
+
+def _count(path: Path, tree: ast.Module) -> Lines:
+    """Return the lines of a file: all, those with code, and those of docstrings (of fields and constants too)."""
+    text = path.read_text(encoding="utf-8")
+    strings = [n for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
+    docstrings = {k for n in strings for k in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
+    layout = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+    tokens = (t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in layout)
+    code = {k for t in tokens for k in range(t.start[0], t.end[0] + 1)}
+    return Lines(text.count("\n"), len(code - docstrings), len(docstrings))
+
+
+def _by_room(counted: dict[Path, Lines], package: Path) -> dict[str, list[Lines]]:
+    """Return the counts of the files of the redesign, and of those of each wing."""
+    out: dict[str, list[Lines]] = {"rooms of the redesign": [], **{wing: [] for wing in WINGS}}
+    for path, lines in counted.items():
+        name = path.relative_to(package).as_posix()
+        wings = (w for w, places in WINGS.items() if any(name == p or name.startswith(f"{p}/") for p in places))
+        out[next(wings, "rooms of the redesign")].append(lines)
+    return out
+
+
+def _told(counted: Iterable[Lines]) -> str:
+    """Return lines, and how many of them are code and docstrings; the rest is blank or a comment."""
+    found = list(counted)
+    code, docstrings = sum(lines.code for lines in found), sum(lines.docstrings for lines in found)
+    return f"{sum(lines.all for lines in found)} ({code} code, {docstrings} docstrings)"
 
 
 def _length(node: Function) -> int:
@@ -80,15 +144,29 @@ def _blocks(node: ast.AST) -> int:
     return deepest + isinstance(node, BLOCKS)
 
 
-def _constants(tree: ast.Module) -> list[str]:
+def _constants(tree: ast.Module) -> list[ast.expr | None]:
+    """Return the values of the names in capitals of a module."""
     found = []
     for node in tree.body:
         targets = (
             node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
         )
         names = [t for target in targets for t in (target.elts if isinstance(target, ast.Tuple) else [target])]
-        found += [t.id for t in names if isinstance(t, ast.Name) and t.id.isupper() and len(t.id) > 1]
+        upper = [t for t in names if isinstance(t, ast.Name) and t.id.isupper() and len(t.id) > 1]
+        found += [node.value for _ in upper if isinstance(node, ast.Assign | ast.AnnAssign)]
     return found
+
+
+def _is_number(value: ast.expr | None) -> bool:
+    """Tell whether a constant is a number, a few of them, or worked out from numbers."""
+    arithmetic = (ast.Constant, ast.BinOp, ast.UnaryOp, ast.operator, ast.unaryop, ast.Tuple, ast.expr_context)
+    parts = list(ast.walk(value)) if value is not None else [ast.Name()]
+    numbers = [p for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, int | float)]
+    return bool(numbers) and all(isinstance(p, arithmetic) and not _is_text(p) for p in parts)
+
+
+def _is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str | bytes)
 
 
 def _floats(tree: ast.Module) -> int:

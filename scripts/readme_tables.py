@@ -236,7 +236,7 @@ def registration() -> str:
 def changed() -> str:
     """Return the table of second sessions after heavy change."""
     whole, alone = _read("changed-homes")["total"], _read("changed-keyframes")["total"]
-    strangers = _read("changed-strangers")
+    other_homes = _read("changed-strangers")
     rows = []
     for name, t, placed, wrong, others in (
         (
@@ -244,7 +244,7 @@ def changed() -> str:
             whole,
             whole["placed"],
             whole["wrong"],
-            f"{strangers['placed']} of {strangers['sessions']}",
+            f"{other_homes['placed']} of {other_homes['sessions']}",
         ),
         (
             "keyframes alone, at true poses",

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from list3r.memory.constraints import Constraints
 from list3r.memory.geometry import Sim3
-from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes
-from list3r.memory.records import Support
+from list3r.memory.merging.edges import Key, MergeSettings, form_groups, links_of, pair_scores
+from list3r.memory.merging.nodes import Nodes
+from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes
+from list3r.memory.records import MergeDecision, Support
 from list3r.memory.store.tables.local_instances import LocalNode
 
 IMAGE = (480, 640)
@@ -145,3 +149,22 @@ CHAIR = Piece("chair", (0.0, 1.0, 0.45), (0.5, 0.5, 0.9), (90, 60, 30), points=2
 CHAIR2 = Piece("chair beside", (0.62, 1.0, 0.45), (0.5, 0.5, 0.9), (90, 60, 30), points=2500)
 WALL = Piece("wall", (0, 2.0, 1.2), (4, 0.02, 2.4), (230, 230, 220), plane=(0, -1, 0, 2.0), structure=True, points=3000)
 ROOM = [FLOOR, TABLE, MUG, TWIN, CLOSE, BOX, MAGAZINE, CHAIR, CHAIR2, WALL]
+
+
+def merge_nodes(
+    chunks: Sequence[ChunkShapes],
+    S_world_chunk: Mapping[int, Sim3],
+    cannot_link: Sequence[tuple[Key, Key]],
+    constraints: Constraints | None = None,
+) -> tuple[list[list[Key]], list[MergeDecision]]:
+    """Group the local instances of whole chunks, which `form_groups` is given piece by piece, by the defaults."""
+    s, grown = MergeSettings(), GrownCells()
+    chunks = sorted(chunks, key=lambda c: c.chunk_id)
+    tables = {c.chunk_id: Nodes.of([c], S_world_chunk) for c in chunks}
+    links = {}
+    for n, u in enumerate(chunks):
+        for v in chunks[n:]:
+            S_u_v = S_world_chunk[u.chunk_id].inverse() @ S_world_chunk[v.chunk_id]
+            scores = pair_scores(u, v, S_u_v, grown)
+            links[u.chunk_id, v.chunk_id] = links_of(tables[u.chunk_id], tables[v.chunk_id], scores, s)
+    return form_groups(tables, links, None, cannot_link, s, constraints)

@@ -9,10 +9,10 @@ import pytest
 
 from list3r.association.revisits.constellations.constellation import Constellation
 from list3r.association.revisits.constellations.matching import MatchingSettings, likeness, match_constellations
-from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, belief, doubt
+from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, log_odds, refusal
 from list3r.association.revisits.constellations.surface_fit import (
     ChunkSurfaces,
-    Held,
+    KnownRelation,
     SurfaceFitSettings,
     fit_surfaces,
 )
@@ -120,7 +120,7 @@ def test_surfaces_bring_a_rough_relation_together_and_up_holds_it_upright() -> N
     rough = S_v_u @ Sim3.exp(np.array([0.08, -0.06, 0.05, 0.02, -0.02, 0.05, 0.04]))
     things = np.array([[1.0, 1.0, 0.5], [3.0, 1.0, 0.5], [2.0, 2.5, 1.0]])
     up = np.array([0.0, 0.0, 1.0])
-    found = fit_surfaces(rough, u, v, Held(things, S_v_u.apply(things), up, up, 1.5), metric=False)
+    found = fit_surfaces(rough, u, v, KnownRelation(things, S_v_u.apply(things), up, up, 1.5), metric=False)
     assert found is not None
     error = np.abs((found.S_v_u.inverse() @ S_v_u).log())
     assert error[:3].max() < 0.02 and np.degrees(error[3:6].max()) < 0.5 and error[6] < 0.01
@@ -139,7 +139,7 @@ def test_a_relation_is_believed_by_all_that_speaks_for_it() -> None:
     }
     settings = ConstellationRegistrationSettings()
     # -3.1 + 0.89 * 3 + 0.33 * 8 - 2.6 * 1 + 9.7 * 0 + 1 * 0 + 9.3 * 0.7
-    assert belief(scores, settings.belief) == pytest.approx(6.12)
-    assert doubt(scores, settings) is None
+    assert log_odds(scores, settings.belief) == pytest.approx(6.12)
+    assert refusal(scores, settings) is None
     for worse in ({"agreeing": 3.0}, {"agreement": 0.6}, {"after": 2.5}, {"fitting": 0.09}, {"rival": 0.95}):
-        assert doubt(scores | worse, settings) is not None
+        assert refusal(scores | worse, settings) is not None

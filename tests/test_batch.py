@@ -22,7 +22,7 @@ from list3r.batch.storage import Output, fetched, listing
 from list3r.batch.tasks import Asked, BatchTask, read_tasks
 from list3r.batch.work import BatchJob, Outcome, run_task
 from list3r.cli.app import run as list3r
-from list3r.cli.build.source_options import SourceWords
+from list3r.cli.build.source_options import SourceArguments
 from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
@@ -31,7 +31,7 @@ from list3r.pipeline.workers import TaskPool, WorkerError
 from list3r.pipeline.workers.ray_pool import RayPool
 from list3r.simulation.dataset import WalkSettings, write_walk
 
-ASKED = Asked(lambda fields: replace(SourceWords(), **fields).options())
+ASKED = Asked(lambda fields: replace(SourceArguments(), **fields).options())
 
 
 @pytest.fixture(scope="module")
@@ -191,9 +191,9 @@ def test_videos_and_memories_may_lie_on_a_store_of_fsspec(folder: Path, built: t
     ("text", "said"),
     [
         ("", "names no video"),
-        ("{", "line 1: .* a line is a path or a JSON object"),
+        ("{", "line 1: .* write a path or a JSON object"),
         ('{"memory": "a"}', "line 1: no source"),
-        ('a.mp4\n{"source": "b.mp4", "lens": 2}', "line 2: one of lens is no option"),
+        ('a.mp4\n{"source": "b.mp4", "lens": 2}', "line 2: lens is no option"),
         ('{"source": "b.mp4", "intrinsics": "1,2"}', "line 1: .*--intrinsics"),
         ("one/walk.mp4\ntwo/walk.mp4", "second video would go to walk.l3r"),
         ('{"source": "a", "memory": "../a"}', "cannot be the name of a memory"),
@@ -211,7 +211,7 @@ def test_one_batch_at_a_time_holds_the_manifest(tmp_path: Path) -> None:
     with Ledger(path), pytest.raises(MemoryFileError, match="being written by this process"):
         Ledger(path)
     path.write_bytes(b"something else that is long enough to be read as a file of SQLite" * 20)
-    with pytest.raises(MemoryFileError, match="no manifest of a batch"):
+    with pytest.raises(MemoryFileError, match="not the state file of a batch"):
         Ledger(path)
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from list3r.catalog import Catalog
 from list3r.catalog.base import open_backend
-from list3r.catalog.catalog import aabb_distance, box_distances
+from list3r.catalog.catalog import box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.cli.app import run as list3r
@@ -109,7 +109,7 @@ def test_within_are_the_boxes_that_meet_a_region(catalog: Catalog) -> None:
     assert inside == {t.id for t in passing(CatalogFilters()) if box_distance(t, middle) <= 0.8}
     met = {m.id for m in catalog.within("random", lower=middle - 1, upper=middle + 1)}
     assert inside <= met
-    assert all(aabb_distance(t, middle) > 1 for t in passing(CatalogFilters()) if t.id not in met)
+    assert all(t.aabb_distance(middle) > 1 for t in passing(CatalogFilters()) if t.id not in met)
 
 
 def test_places_of_one_memory_are_found_by_the_index_of_memory_and_box(server: PostgresServer) -> None:
@@ -158,7 +158,7 @@ def test_stored_relations_answer_by_words_and_ids(catalog: Catalog) -> None:
     assert {(r.subject % 3, r.object % 3) for r in found} == {(0, 1)}
     with pytest.raises(OptionError, match="not one that is stored"):
         catalog.relations("random", predicate="left_of")
-    with pytest.raises(OptionError, match="number in one memory"):
+    with pytest.raises(OptionError, match="belongs to one memory"):
         catalog.relations(subject=3)
 
 
@@ -390,12 +390,12 @@ def test_a_catalogue_written_anew_answers_the_same(room: Path, tmp_path: Path) -
 
 
 def test_files_that_are_no_catalogue_are_refused(tmp_path: Path, room: Path) -> None:
-    with pytest.raises(CatalogError, match="is no catalogue"):
+    with pytest.raises(CatalogError, match="is not a catalogue"):
         Catalog.open(str(room))
     (tmp_path / "text").write_text("no database at all, but long enough to be taken for the head of one" * 20)
     with pytest.raises(CatalogError, match="cannot be opened"):
         Catalog.open(str(tmp_path / "text"))
-    with pytest.raises(CatalogError, match="mysql:// is no catalogue"):
+    with pytest.raises(CatalogError, match="mysql:// is not a catalogue"):
         Catalog.open("mysql://here/a")
 
 

@@ -12,7 +12,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.maintenance.history import world_at
-from list3r.memory.overlap.visibility import DepthView, look
+from list3r.memory.overlap.visibility import DepthView, place_visibility
 from list3r.memory.records import ChangeEvent
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
@@ -33,7 +33,7 @@ def _patch(z: float = 2.0, half: float = 0.06, count: int = 12) -> Array:
 
 
 def test_a_surface_at_its_place_is_there() -> None:
-    found = look(_patch(), [_view(2.01, 0), _view(1.99, 1, 0.1)])
+    found = place_visibility(_patch(), [_view(2.01, 0), _view(1.99, 1, 0.1)])
     assert found.verdict == "there"
     assert found.free == 0.0
     assert len(found.frames) == 2
@@ -41,26 +41,29 @@ def test_a_surface_at_its_place_is_there() -> None:
 
 def test_free_space_through_a_place_means_gone_and_needs_four_frames() -> None:
     views = [_view(2.6, k, 0.05 * k) for k in range(4)]
-    assert look(_patch(), views).verdict == "gone"
-    assert look(_patch(), views[:3]).verdict != "gone"
+    assert place_visibility(_patch(), views).verdict == "gone"
+    assert place_visibility(_patch(), views[:3]).verdict != "gone"
 
 
 @pytest.mark.parametrize("depth", [1.2, 0.0])
 def test_what_is_hidden_or_without_depth_is_unseen(depth: float) -> None:
-    assert look(_patch(), [_view(depth, 0), _view(depth, 1)]).verdict == "unseen"
+    assert place_visibility(_patch(), [_view(depth, 0), _view(depth, 1)]).verdict == "unseen"
 
 
 def test_what_lies_outside_the_picture_is_unseen() -> None:
-    assert look(_patch() + np.array([5.0, 0.0, 0.0]), [_view(2.6, 0), _view(2.6, 1)]).verdict == "unseen"
-    assert look(_patch() * np.array([1, 1, -1]), [_view(2.6, 0), _view(2.6, 1)]).verdict == "unseen"
-    assert look(_patch(), []).verdict == "unseen"
+    assert place_visibility(_patch() + np.array([5.0, 0.0, 0.0]), [_view(2.6, 0), _view(2.6, 1)]).verdict == "unseen"
+    assert place_visibility(_patch() * np.array([1, 1, -1]), [_view(2.6, 0), _view(2.6, 1)]).verdict == "unseen"
+    assert place_visibility(_patch(), []).verdict == "unseen"
 
 
 def test_an_edge_beside_the_place_is_not_free_space() -> None:
     """A small error of alignment shows the background through the rim of a thing, not through its middle."""
     picture = np.full((120, 160), 2.6, np.float32)
     picture[52:68, 73:89] = 2.0
-    assert look(_patch() + np.array([0.01, 0.0, 0.0]), [_view(picture, 0), _view(picture, 1)]).verdict == "there"
+    assert (
+        place_visibility(_patch() + np.array([0.01, 0.0, 0.0]), [_view(picture, 0), _view(picture, 1)]).verdict
+        == "there"
+    )
 
 
 def _event(kind: str, session: int, instance: int, moved: float = 1.0) -> ChangeEvent:

@@ -170,7 +170,7 @@ MORE_CASES = {
         "build {p}/good -m {p}/new.l3r --weights {p}/empty",
         "no network does the reconstruction.*--recon",
     ),
-    "weights without a name": ("build {p}/good -m {p}/new.l3r --weights discovery=", "names nothing"),
+    "weights without a name": ("build {p}/good -m {p}/new.l3r --weights discovery=", "is empty"),
     "classes without a detector": ("build {p}/good -m {p}/new.l3r --detector-classes {p}/note.txt", "--detector FILE"),
     "classes that are not there": (
         "detect {p}/room.l3r --detector {p}/note.txt --detector-classes {p}/no",
@@ -197,12 +197,12 @@ MORE_CASES = {
     "demo of one frame": ("demo --out {p}/demo --frames 1", "--frames 1: at least 2"),
     "demo of a negative seed": ("demo --out {p}/demo --seed -1", "--seed -1: at least 0"),
     "demo without workers": ("demo --out {p}/demo --workers 0", "--workers 0: at least 1"),
-    "precompute onto a file": ("precompute {p}/good --out {p}/note.txt", "note.txt cannot be made.*another"),
+    "precompute onto a file": ("precompute {p}/good --out {p}/note.txt", "note.txt cannot be created.*another"),
     "precompute of broken pictures": ("precompute {p}/corrupt --out {p}/broken", "5 of 6 frames cannot be used"),
     "embed of nothing": ("embed {p}/nothing.l3r", "does not exist"),
     "more sure than sure": ("list {p}/room.l3r --min-confidence 7", "--min-confidence 7"),
     "a session of no camera": ("query seen {p}/room.l3r 3 --session 9", "--session 9 goes with a camera"),
-    "a depth of no camera": ("query seen {p}/room.l3r 3 --max-depth 3", "--max-depth is how far a camera sees"),
+    "a depth of no camera": ("query seen {p}/room.l3r 3 --max-depth 3", "--max-depth belongs to a camera"),
     "a session of a box": ("query within {p}/room.l3r --box 0,0,0,1,1,1 --session 9", "--session 9 goes with a camera"),
     "who looks": ("query find {p}/room.l3r mug --from here", "viewpoint 'here'"),
     "sizes that leave nothing": (

@@ -145,7 +145,7 @@ CASES = {
     "no points wanted": ("cloud {p}/room.ply {p}/room.l3r --points 0", "points 0"),
     "instances of nothing": ("instances {p}/absent.json {p}/room.l3r", "absent.json"),
     "instances of no scene": ("instances {p}/blank.json {p}/room.l3r", "blank.json has no list of instances"),
-    "ids in no folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/absent", "absent is no folder"),
+    "ids in no folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/absent", "absent is not a folder"),
     "ids without masks": ("instances {p}/truth/truth.json {p}/room.json --ids {p}/folder", "no masks"),
     "ids in an empty folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/folder", "holds no .png"),
     "ids of every zeroth frame": ("instances {p}/truth/truth.json {p}/room.l3r --every 0", "--every 0"),

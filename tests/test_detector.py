@@ -25,7 +25,7 @@ from list3r.memory.store.store import Store
 from list3r.semantics.detection import detect
 from list3r.semantics.detector import Detections
 from list3r.semantics.nanodet import DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
-from list3r.semantics.voting import Seen, summed, vote
+from list3r.semantics.voting import ThingInFrame, summed, vote
 from tests.session_scenes import ROOM, add_session, cameras, place_together
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -46,11 +46,11 @@ def found(*rows: tuple[tuple[float, ...], float, int]) -> Detections:
     )
 
 
-def seen(local_id: int, x0: int, y0: int, x1: int, y1: int, **more: object) -> Seen:
+def seen(local_id: int, x0: int, y0: int, x1: int, y1: int, **more: object) -> ThingInFrame:
     mask = np.zeros((480, 640), bool)
     mask[y0:y1, x0:x1] = True
     fields: dict[str, object] = {"locals": (local_id,), "shares": (1.0,), "visible": 1.0, **more}
-    return Seen(box_xyxy=box(x0, y0, x1, y1), mask=mask, **fields)  # type: ignore[arg-type]
+    return ThingInFrame(box_xyxy=box(x0, y0, x1, y1), mask=mask, **fields)  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------------------------------------- boxes

@@ -70,7 +70,7 @@ def test_files_of_every_kind_hold_the_same_points(tmp_path: Path) -> None:
         cloud = read_cloud(tmp_path / name)
         assert np.allclose(cloud.points, points, atol=1e-6), name
         assert cloud.normals is None
-        assert "200 points" in cloud.words
+        assert "200 points" in cloud.text
 
 
 def test_normals_of_a_ply_and_faces_of_a_mesh_are_used(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_points_that_are_not_finite_are_left_out_and_said(tmp_path: Path) -> Non
     np.save(tmp_path / "a.npy", np.array([[0, 0, 0], [np.nan, 0, 0], [1, 2, 3.0]]))
     cloud = read_cloud(tmp_path / "a.npy")
     assert len(cloud.points) == 2
-    assert "1 that are not finite left out" in cloud.words
+    assert "1 that are not finite left out" in cloud.text
 
 
 @pytest.mark.parametrize("name", ["absent.ply", "a.doc", "text.ply", "empty.xyz", "two.npy", "nan.npy", "words.xyz"])
@@ -150,5 +150,5 @@ def test_icp_names_what_it_cannot_align() -> None:
     with pytest.raises(DegenerateError, match="nearly"):
         register(truth, normals, truth + 50.0, with_scale=False, settings=IcpSettings())
     flat = normals[:, 2] == 1
-    with pytest.raises(DegenerateError, match="leave a motion open"):
+    with pytest.raises(DegenerateError, match="leave a motion undetermined"):
         register(truth[flat], normals[flat], truth[flat], with_scale=False, settings=IcpSettings())

@@ -11,7 +11,7 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.exporters.meshes.closed import ClosedSurface, divided, hull, is_closed, slab, zero_level
+from list3r.exporters.meshes.closed import ClosedSurface, divided, hull, slab, zero_level
 from list3r.exporters.meshes.instance_mesh import instance_mesh
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
@@ -196,3 +196,12 @@ def test_names_of_props_are_plain(tmp_path: Path) -> None:
         memory.export("simready", tmp_path / "sim", density=1.0)
     assert (tmp_path / "sim/ecran_plat_3_1/simready_usd/ecran_plat_3_1.usd").is_file()
     assert json.loads((tmp_path / "sim/list3r-simready.json").read_text())["format"] == "list3r-simready"
+
+
+def is_closed(surface: ClosedSurface) -> bool:
+    """Tell whether each edge has one face on either side, which run through it in opposite directions."""
+    edges = np.concatenate([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    if not len(edges) or len(np.unique(edges, axis=0)) != len(edges):
+        return False
+    key = edges[:, 0] * len(surface.vertices) + edges[:, 1]
+    return bool(np.isin(edges[:, 1] * len(surface.vertices) + edges[:, 0], key).all())

@@ -82,9 +82,9 @@ def test_an_open_loop_drifts_and_graphs_are_not_mixed(tmp_path: Path) -> None:
 
 
 WRONG = {
-    "no trajectory": ("a,b\n1,2\n", "no trajectory of Aria"),
-    "empty": ("", "no trajectory of Aria"),
-    "cut off": (None, "line 31 is no row"),
+    "not a trajectory": ("a,b\n1,2\n", "not a trajectory of Aria"),
+    "empty": ("", "not a trajectory of Aria"),
+    "cut off": (None, "line 31 is not a row"),
     "of another recording": (
         NAMES.format(w="world_device") + "\na,9000000000,0,0,0,0,0,0,0,nan\n",
         "no pose at the time",
@@ -124,7 +124,7 @@ def test_the_extra_is_named(tmp_path: Path) -> None:
 @pytest.mark.skipif(not installed, reason="the extra aria is not installed")
 def test_noise_is_one_clear_line(tmp_path: Path) -> None:
     put(tmp_path / "walk.vrs", b"\x89" * 500)
-    with pytest.raises(SourceError, match="no recording in VRS"):
+    with pytest.raises(SourceError, match="not a recording in VRS"):
         open_source(tmp_path / "walk.vrs")
     with pytest.raises(OptionError, match="states its own cameras"):
         open_source(tmp_path / "walk.vrs", SourceOptions(intrinsics=(600, 600, 700, 700)))

@@ -124,7 +124,7 @@ def test_up_is_unknown_without_cameras() -> None:
 
 def test_world_from_graph_is_the_smallest_rotation() -> None:
     for up in ([0, 0, 1.0], [0, 0, -1.0], [0, -1.0, 0], [0.6, 0, 0.8]):
-        gravity = Gravity("estimated", np.array(up, float), 1.0, 0.0, 1.0, None, "")
+        gravity = Gravity("estimated", np.array(up, float), None, "")
         rotation = world_from_graph(gravity).rotation
         angle = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
         assert np.isclose(angle, np.arccos(up[2]))

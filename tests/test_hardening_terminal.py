@@ -130,7 +130,7 @@ def test_links_that_lead_to_themselves_are_said(tmp_path: Path, capsys: pytest.C
 
 def test_names_that_are_no_text_are_not_written(make_memory: Make, capsys: pytest.CaptureFixture[str]) -> None:
     path, name = make_memory(), os.fsdecode(b"w\xffalk")
-    with Store.open(path, writable=True) as store, pytest.raises(OptionError, match="no text of UTF-8"):
+    with Store.open(path, writable=True) as store, pytest.raises(OptionError, match="not valid UTF-8"):
         with store.transaction():
             store.sessions.add(name, "", {}, 4)
     assert run(["label", str(path), "2", name]) == 2 and "error: " in capsys.readouterr().err

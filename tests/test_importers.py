@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 import list3r
+from list3r.importers.base import imported_as
 from list3r.importers.hydra import symbol
 from list3r.importers.importing import IMPORTED, import_map, upright
 from list3r.importers.ply import read_vertices
 from list3r.importers.registry import read_map
+from list3r.importers.standing import doubt_of_up
 from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.viewer.world import read_world
@@ -156,9 +158,9 @@ def test_older_boxes_and_names_of_spark_dsg_are_read(tmp_path: Path) -> None:
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n",
             "ends",
         ),
-        ("cloud.ply", b"PLY", "no PLY"),
+        ("cloud.ply", b"PLY", "not a PLY"),
         ("dsg.json", b'{"nodes": [], "layer_ids": []}', "holds no things"),
-        ("other.json", b'{"a": 1}', "no map of"),
+        ("other.json", b'{"a": 1}', "not a map of"),
     ],
 )
 def test_what_is_no_map_is_refused_and_leaves_nothing(name: str, data: bytes, why: str, tmp_path: Path) -> None:
@@ -188,3 +190,20 @@ def test_the_axis_that_points_up_becomes_z(axis: str) -> None:
     unit = np.zeros(3)
     unit["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
     assert np.allclose(R @ unit, [0, 0, 1]) and np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_a_map_whose_things_stand_along_another_axis_is_told() -> None:
+    boxes = [(np.array([0.5 * k, 1.0, 0.35]), np.array([0.4, 0.8, 0.7])) for k in range(5)]
+    boxes += [(np.array([0.5 * k, 1.0, 0.75]), np.array([0.1, 0.1, 0.1])) for k in range(5)]
+    for axis in ("z", "y", "-x"):
+        things = [(points(box) @ upright(axis)).astype(np.float32) for box in boxes]
+        assert doubt_of_up(things, axis) == ()
+        (told,) = doubt_of_up(things, "z" if axis != "z" else "y")
+        assert f"--up {axis}" in told
+
+
+def test_an_instance_tells_what_its_map_calls_it(tmp_path: Path) -> None:
+    report = import_map(hovsg(tmp_path / "map"), tmp_path / "m.l3r", up="y")
+    with Store.open(tmp_path / "m.l3r") as store:
+        origin = imported_as(store, report.ids["0_0_1"])
+    assert origin is not None and (origin["format"], origin["names"]) == ("hovsg", ["0_0_1"])

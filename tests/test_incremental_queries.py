@@ -16,7 +16,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.match import Filters
 from list3r.queries.nearest import nearest
 from list3r.queries.similar import similar
-from list3r.queries.views.surfaces import distance_between, distance_to_point, surface_points
+from list3r.queries.views.surfaces import distance_between, distance_to_point, surface_of
 from list3r.queries.within import within
 from tests.conftest import instance
 
@@ -101,7 +101,7 @@ def test_within_finds_what_a_scan_finds(store: Store) -> None:
     for center in rng.normal(size=(20, 3)) * [4, 4, 1]:
         found = {m.instance.id for m in within(store, center=center, radius=0.8)}
         things = store.instances.all(structure=False)
-        inside = {i.id for i in things if (np.linalg.norm(surface_points(store, i)[0] - center, axis=1) <= 0.8).any()}
+        inside = {i.id for i in things if (np.linalg.norm(surface_of(store, i).points - center, axis=1) <= 0.8).any()}
         assert found == inside
 
 

@@ -17,9 +17,9 @@ from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CloudCut, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph, Surroundings, chunk_surface
-from list3r.instances.learned.network import Judgement, judge
+from list3r.instances.learned.network import Classification, classify
 from list3r.instances.learned.pieces import cut_pieces
-from list3r.instances.learned.things import ThingVerdicts, judge_things, names_of, thing_features
+from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
 from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings
@@ -81,7 +81,7 @@ def test_the_network_says_the_same_in_numpy_and_torch() -> None:
     network = model.PieceNetwork(NODE_FEATURES, EDGE_FEATURES, 7).eval()
     graph = random_graph(8)
     arrays = {f"fine.{k}": v.detach().numpy() for k, v in network.state_dict().items()}
-    told = judge(arrays, "fine", graph)
+    told = classify(arrays, "fine", graph)
     given = (graph.nodes, graph.left, graph.right, graph.edges, graph.reversed_edges())
     with torch.no_grad():
         affinity, structure, names, hidden = network(*(torch.from_numpy(a) for a in given))
@@ -122,14 +122,14 @@ def test_verdicts_on_things_are_probabilities_whatever_the_order_of_things() -> 
     rng = np.random.default_rng(1)
     log_names = np.log(rng.dirichlet(np.ones(len(names)), count)).astype(np.float32)
     hidden = rng.normal(size=(count, len(weights["coarse.node_head.weight"][0]))).astype(np.float32)
-    told = Judgement(rng.normal(size=len(graph.left)), rng.normal(size=count), log_names, hidden)
+    told = Classification(rng.normal(size=len(graph.left)), rng.normal(size=count), log_names, hidden)
     own = rng.integers(5, size=count)
-    said = judge_things(weights, own, graph, told)
+    said = classify_things(weights, own, graph, told)
     assert (
         said.names.shape == (5, len(names)) and (said.names >= 0).all() and (said.names.sum(axis=1) <= 1 + 1e-5).all()
     )
     assert ((said.whole > 0) & (said.whole < 1)).all() and ((said.structure >= 0) & (said.structure <= 1)).all()
-    turned = judge_things(weights, 4 - own, graph, told)
+    turned = classify_things(weights, 4 - own, graph, told)
     assert np.allclose(turned.whole[::-1], said.whole, atol=1e-5)
     assert np.allclose(turned.names[::-1], said.names, atol=1e-4)
     assert thing_features(own, graph, told)[1].shape[1] == len(weights["things.mean"])
@@ -157,7 +157,7 @@ def test_it_is_the_default_and_damage_to_its_weights_is_said(tmp_path: Path, mon
 def test_a_session_of_a_discoverer_that_is_gone_says_how_to_go_on() -> None:
     depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
     begun = BuildSettings(discovery="geometric")
-    with pytest.raises(OptionError, match="go on with --discovery learned"):
+    with pytest.raises(OptionError, match="continue with --discovery learned"):
         settings_resumed(BuildRequest(), begun, depth, "any")
     assert settings_resumed(BuildRequest(discovery="learned"), begun, depth, "any")[0].discovery == "learned"
 

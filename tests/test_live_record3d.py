@@ -87,7 +87,7 @@ def test_a_damaged_frame_is_bad_and_damage_between_frames_ends_a_connection(
     assert (state.count, state.cuts) == (COUNT, (3,))
     frames = list(open_source(tmp_path / "f").read(0, COUNT))
     assert [k for k, f in enumerate(frames) if isinstance(f, BadFrame)] == [1]
-    assert any("no frame of Record3D 1.10" in line for line in told)
+    assert any("not a frame of Record3D 1.10" in line for line in told)
     assert any("4294967295 bytes" in line for line in told)
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging.edges import Key, merge_nodes
+from list3r.memory.merging.edges import Key
 from list3r.memory.overlap.voxels import chunk_shapes, coverage
-from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, ROOM, TABLE, Piece, Walk, node, surface, walk
+from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, ROOM, TABLE, Piece, Walk, merge_nodes, node, surface, walk
 
 
 def names(w: Walk, groups: list[list[Key]]) -> list[set[str]]:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from list3r.memory.overlap.missed import LookSettings, frames_beside, misses
+from list3r.memory.overlap.missed import MissedSettings, frames_beside, misses
 from list3r.memory.overlap.voxels import PIXEL_BITS, ChunkShapes, chunk_shapes
 
 FRAMES = range(0, 30, 3)
@@ -28,7 +28,7 @@ def chunk(chunk_id: int, areas: dict[int, int], owner: np.ndarray, local_id: int
 
 def missed(finder: ChunkShapes, other: ChunkShapes) -> bool:
     chunks = {1: finder, 2: other}
-    return misses(2, [(1, THING)], chunks, frames_beside(chunks, [(1, 2)]), LookSettings())
+    return misses(2, [(1, THING)], chunks, frames_beside(chunks, [(1, 2)]), MissedSettings())
 
 
 WHOLE = dict.fromkeys(FRAMES, 20)

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r.evaluation.calibration import calibration
+from benchmarks.calibration import calibration
 from list3r.instances.geometric.support import without_fliers
-from list3r.instances.learned.belief import NameBelief, NameSigns, believed, name_signs
+from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs, with_confidence
 from list3r.memory.library.labels import (
     OWN_NAMES,
     LabelSettings,
@@ -62,7 +62,7 @@ def test_what_is_believed_keeps_the_likeliest_name_and_adds_up_to_no_more_than_o
     rng = np.random.default_rng(seed)
     names = rng.dirichlet(np.full(6, 0.5), 5) * rng.uniform(0.05, 1.0, (5, 1))
     right = rng.uniform(0.0, 1.0, 5)
-    out = believed(names, right)
+    out = with_confidence(names, right)
     rows, best = np.arange(5), names.argmax(axis=1)
     assert np.allclose(out[rows, best], right)
     assert (out >= 0.0).all() and (out.sum(axis=1) <= 1.0 + 1e-9).all()
@@ -71,7 +71,7 @@ def test_what_is_believed_keeps_the_likeliest_name_and_adds_up_to_no_more_than_o
 
 
 def test_a_name_is_believed_less_in_a_room_full_of_doubt_and_of_what_is_no_whole() -> None:
-    belief, whole = NameBelief(), np.full(10, 0.9)
+    belief, whole = NameConfidence(), np.full(10, 0.9)
     sure = np.array([[0.9, 0.1]])
     names = np.concatenate([sure, np.repeat([[0.35, 0.3]], 9, axis=0)])
     alone = belief.probability(name_signs(sure, whole[:1], np.zeros(1)))[0]

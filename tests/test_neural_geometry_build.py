@@ -23,7 +23,7 @@ from list3r.memory.store.store import Store
 from list3r.models.device import Gpu
 from list3r.pipeline import choice
 from list3r.pipeline.choice import settings_asked
-from list3r.pipeline.chunks.chunk import ChunkTask, joint_model, process_chunk, process_parts
+from list3r.pipeline.chunks.chunk import ChunkTask, joint_model, process_parts
 from list3r.pipeline.chunks.joint_windows import joint_windows
 from list3r.pipeline.request import BuildRequest
 from list3r.pipeline.settings import BuildSettings
@@ -89,7 +89,7 @@ def test_pictures_become_a_memory(name: str, upstream: None, pictures: Path, tmp
 def test_a_chunk_goes_through_every_stage(name: str, upstream: None, pictures: Path, tmp_path: Path) -> None:
     weights = neural_scenes.weights(name, tmp_path / "weights", neural_scenes.film())
     settings = BuildSettings(reconstruction=name, device="cpu", weights=str(weights))
-    result = process_chunk(ChunkTask(str(pictures), SourceOptions(), ChunkSpan(0, 0, 12), settings))
+    result = process_parts(ChunkTask(str(pictures), SourceOptions(), ChunkSpan(0, 0, 12), settings))[-1]
     assert result.posed.all() and result.scale_kind == "relative"
     assert len(result.keyframes) >= 2 and len(result.samples.points) > 1000
     assert len(result.library.instances) >= 3
@@ -113,7 +113,7 @@ def test_geometry_written_in_one_place_is_built_in_another(
     with list3r.open(tmp_path / "m.l3r") as scene:
         assert len(scene.store.chunks.all()) == 2, "cut as the files are"
     assert run([*out[:-4], "--chunk", "6", "--overlap", "3"]) == 2
-    assert "holds files of another model or other chunks" in capsys.readouterr().err
+    assert "holds files of another model or of other chunks" in capsys.readouterr().err
 
 
 def test_errors_are_one_line(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,9 +17,11 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion import movers
 from list3r.reconstruction.prior import PriorSettings, bridged, mean_alignment, source_from_chunk, steady_runs
+from list3r.reconstruction.rgbd.odometry import CameraTracker, TrackedSegment
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.registration import PosePrior, Samples, register
+from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
+from list3r.reconstruction.rgbd.surfels import SurfelModel
 from list3r.reconstruction.rgbd.view import make_view
 from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, walk
 
@@ -220,3 +222,39 @@ def test_a_prior_that_cannot_serve_is_refused(changes: dict[str, object], why: s
 def test_poses_of_colour_alone_are_no_prior() -> None:
     with pytest.raises(OptionError, match=r"sensor depth.*has none; use --poses given"):
         check_buildable(info(has_depth=False), BuildSettings(reconstruction="sfm", poses="prior"))
+
+
+def placed(shift_m: float, inliers: float, correlation: float) -> FrameRegistration:
+    """A frame found so far from its stated step, and how well it fits there."""
+    T = np.eye(4)
+    T[0, 3] = shift_m
+    return FrameRegistration(T, 0.9, inliers, 1.0, correlation, 5000, 1e8 * np.eye(6))
+
+
+@pytest.mark.parametrize(
+    ("found", "believed"),
+    [
+        (placed(0.01, 0.7, 0.5), True),
+        (placed(0.12, 0.93, 0.98), True),  # a true jump, at the end of a quick turn
+        (placed(0.34, 0.95, 0.63), False),  # a blurred picture of a bare floor
+        (placed(0.10, 0.83, 0.94), False),  # another
+        (placed(0.12, 0.95, float("nan")), False),
+    ],
+)
+def test_a_jump_is_believed_where_the_frame_fits_as_those_before(
+    found: FrameRegistration, believed: bool, frames: list[Frame]
+) -> None:
+    tracker = CameraTracker(frames, CAMERA, OdometrySettings(), prior=True)
+    segment = TrackedSegment(SurfelModel(OdometrySettings().fusion, OdometrySettings().noise), usual_inliers=0.96)
+    assert tracker._believed(segment, PosePrior(np.eye(4), 0.002, 0.002, 30.0), found) is believed
+
+
+def test_a_frame_that_contradicts_its_step_in_vain_stays_out_of_the_model(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(CameraTracker, "_believed", lambda *_: False)
+    tracker = CameraTracker(frames[:4], CAMERA, OdometrySettings(), prior=True)
+    (segment,) = tracker.run()
+    assert sorted(segment.T_segment_cam) == [0, 1, 2, 3] and segment.keyframes == [0]
+    steps = [np.linalg.inv(frames[0].T_source_cam) @ f.T_source_cam for f in frames[:4]]  # type: ignore[arg-type]
+    assert all(np.allclose(segment.T_segment_cam[k], steps[k], atol=1e-9) for k in range(4))

@@ -21,7 +21,7 @@ from list3r.pipeline.choice import (
     stored_sessions,
 )
 from list3r.pipeline.finishing import check_run
-from list3r.pipeline.request import BuildRequest, RunOptions, RunWords
+from list3r.pipeline.request import BuildRequest, RunArguments, RunOptions
 from list3r.pipeline.settings import AssociationSettings, BuildSettings
 
 INFO = SourceInfo("tum", "walk", 100, 30.0, Camera(320, 240, 260.0, 260.0, 159.5, 119.5), True, True, "metric", "f")
@@ -31,7 +31,7 @@ BEGUN = BuildSettings(
 
 
 def test_python_takes_the_words_of_the_run_by_the_same_names_and_types() -> None:
-    assert get_type_hints(RunWords) == get_type_hints(RunOptions)
+    assert get_type_hints(RunArguments) == get_type_hints(RunOptions)
 
 
 @pytest.mark.parametrize("command", ["build", "update"])

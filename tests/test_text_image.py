@@ -18,7 +18,7 @@ from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.finding.free_words import named_by_vectors
 from list3r.queries.nearest import nearest
-from list3r.semantics.embedding import StoredWords, embed_memory, stored_words
+from list3r.semantics.embedding import StoredTextModel, embed_memory, stored_text_model
 from list3r.semantics.text_image import TextImageModel, square_crop
 from tests.neural_models import save_text_image
 
@@ -78,13 +78,13 @@ def test_embedding_a_memory_lets_free_words_find(memory: Path, weights: dict[str
     report = embed_memory(memory, str(weights["clip"]), "cpu")
     assert report.instances > 0
     with Store.open(memory) as store:
-        words = stored_words(store)
+        words = stored_text_model(store)
         assert words is not None and words.space == report.space
         ids, vectors = store.embeddings.all(report.space)
         assert len(ids) == report.instances
         np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0, rtol=1e-4)
 
-        class Chosen(StoredWords):
+        class Chosen(StoredTextModel):
             """The same words, with a bar that random weights can pass."""
 
             min_cosine = -1.0
@@ -119,6 +119,6 @@ def test_weights_that_went_away_are_a_note(memory: Path, tmp_path: Path) -> None
     embed_memory(memory, str(folder), "cpu")
     (folder / "model.safetensors").unlink()
     with Store.open(memory) as store:
-        found = find(store, "zebra", encoder=stored_words(store))
+        found = find(store, "zebra", encoder=stored_text_model(store))
         assert not found and any("cannot be compared" in note for note in found.notes)
-        assert nearest(store, words="zebra", encoder=stored_words(store)) == []
+        assert nearest(store, words="zebra", encoder=stored_text_model(store)) == []

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import group
 from list3r.instances.learned.graph import PieceGraph, Surroundings, chunk_surface
-from list3r.instances.learned.network import judge
+from list3r.instances.learned.network import classify
 from list3r.instances.learned.pieces import Pieces, cut_pieces
 from training.samples import Sample, read_sample
 from training.worlds.catalogue import LABELS
@@ -94,7 +94,7 @@ def second_lessons(path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path,
         truth = sample.truth_of(cloud)
         pieces, g = Pieces(labels, lesson.graph), lesson.graph
         surface = chunk_surface(cloud, sample.views, surroundings_of(sample))
-        told = judge(arrays, "fine", g)
+        told = classify(arrays, "fine", g)
         made: dict[Ends, tuple[NDArray[np.int64], NDArray[np.int32], PieceGraph]] = {}
         for end, file in zip(ends, files, strict=True):
             for k in range(1, len(end) + 1):
@@ -104,7 +104,7 @@ def second_lessons(path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path,
                     own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, end[0])
                 else:
                     before, _, h = made[end[: k - 1]]
-                    said = judge(arrays, "coarse", h).affinity
+                    said = classify(arrays, "coarse", h).affinity
                     own = agglomerate(len(h.nodes), h.left, h.right, said, h.weight, end[k - 1])[before]
                 made[end[:k]] = (own, *group(surface, pieces, told, own))
             _, parts, graph = made[end]

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CutSettings
-from list3r.instances.learned.network import Judgement, judge, two_layers
+from list3r.instances.learned.network import Classification, classify, two_layers
 from list3r.instances.learned.things import NODES_AT, SHOWN_NODES, thing_features
 from training.fit import BLIND, SEEING, Blindness
 from training.graphs import Lesson
@@ -32,7 +32,7 @@ OTHER_ENDS = (-2.5, -1.0, 1.0)
 
 @dataclass(frozen=True)
 class ThingFit:
-    """How the judge of things is trained."""
+    """How the classifier of things is trained."""
 
     hidden: int = 256
     steps: int = 6000
@@ -78,9 +78,9 @@ def overlaps(
     return best, which, bound
 
 
-def clusters(arrays: Arrays, lesson: Lesson, enough: float) -> tuple[NDArray[np.int64], Judgement]:
+def clusters(arrays: Arrays, lesson: Lesson, enough: float) -> tuple[NDArray[np.int64], Classification]:
     """Return the thing of each part of a graph (P,), and what the second network said."""
-    told = judge(arrays, "coarse", lesson.graph)
+    told = classify(arrays, "coarse", lesson.graph)
     g = lesson.graph
     return agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, enough), told
 
@@ -89,7 +89,7 @@ def table_of(arrays: Arrays, lessons: Sequence[Lesson], *, more: bool) -> ThingT
     """Return the clusters of several chunks; with `more` those of other thresholds and of the truth, too."""
     rows: list[tuple[NDArray[Any], ...]] = []
     for lesson in lessons:
-        told, g = judge(arrays, "coarse", lesson.graph), lesson.graph
+        told, g = classify(arrays, "coarse", lesson.graph), lesson.graph
         ends = (CutSettings().enough, *(OTHER_ENDS if more else ()))
         groupings = [agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, end) for end in ends]
         if more:
@@ -111,7 +111,7 @@ def fit_things(
     settings: ThingFit | None = None,
     blind: Blindness = SEEING,
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the judge of things, trained on `lessons` and calibrated on left-out worlds."""
+    """Return the arrays of the classifier of things, trained on `lessons` and calibrated on left-out worlds."""
     s = settings or ThingFit()
     table = table_of(arrays, lessons, more=True)
     free = ~table.structure

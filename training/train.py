@@ -58,15 +58,15 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="folder of an earlier run whose first network is trained on")
     parser.add_argument("--without", choices=sorted(ABLATIONS), help="an ablation: what the networks do not see")
     parser.add_argument("--weights", type=Path, help="where the weights go; out/weights.npz without it")
-    words = parser.parse_args()
+    args = parser.parse_args()
     torch.set_num_threads(1)
-    data = words.out / "chunks"
-    paths = [make_sample(FIRST_SEED + k, data) for k in range(words.worlds)]
-    paths += [make_sample(FIRST_FITTED_SEED + k, data, fitted=True) for k in range(words.fitted)]
-    paths += [make_sample(FIRST_ODD_SEED + k, data, fitted=k % 3 == 2, odd=ODD_SHARE) for k in range(words.odd)]
-    held = [make_sample(FIRST_HELD_SEED + k, data, held_out=True) for k in range(words.held)]
-    held += [make_sample(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(words.held)]
-    train(paths, held, words.out, words.epochs, words.weights or words.out / "weights.npz", words.start, words.without)
+    data = args.out / "chunks"
+    paths = [make_sample(FIRST_SEED + k, data) for k in range(args.worlds)]
+    paths += [make_sample(FIRST_FITTED_SEED + k, data, fitted=True) for k in range(args.fitted)]
+    paths += [make_sample(FIRST_ODD_SEED + k, data, fitted=k % 3 == 2, odd=ODD_SHARE) for k in range(args.odd)]
+    held = [make_sample(FIRST_HELD_SEED + k, data, held_out=True) for k in range(args.held)]
+    held += [make_sample(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(args.held)]
+    train(paths, held, args.out, args.epochs, args.weights or args.out / "weights.npz", args.start, args.without)
 
 
 def train(
@@ -78,7 +78,7 @@ def train(
     start: Path | None = None,
     without: str | None = None,
 ) -> None:
-    """Train both networks and the judge of things on chunks, and write the weights."""
+    """Train both networks and the classifier of things on chunks, and write the weights."""
     lessons, seen = [first_lesson(p)[0] for p in paths], [first_lesson(p)[0] for p in held]
     blind = ABLATIONS[without] if without else SEEING
     depth = 3 if blind.messages else 0

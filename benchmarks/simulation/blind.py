@@ -22,7 +22,7 @@ from list3r.simulation.walk import look_poses
 
 Array = NDArray[np.float64]
 
-WALKED, WALL, TURN, DARK = "walked", "wall", "turn", "dark"
+WALKED, WALL, TURN, DARK, LOWERED = "walked", "wall", "turn", "dark", "lowered"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,9 @@ class BlindWalk:
     T_world_cam: Array
     """Shape (F, 4, 4)."""
     stretch: tuple[str, ...]
-    """Of each frame: walked, wall, turn or dark."""
+    """Of each frame: walked, wall, turn or dark; of a phone that is lowered, lowered."""
+    exposure_s: float = 0.0
+    """Time over which pictures of turns are drawn out."""
 
 
 def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
@@ -74,7 +76,7 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
     dark_from = round(blind.dark_at * len(poses))
     rest = [DARK if 0 <= k - dark_from < round(blind.dark_s * fps) else WALKED for k in range(at + 1, len(poses))]
     T = np.concatenate([poses[: at + 1], detour, poses[at + 1 :]])
-    return BlindWalk(np.arange(len(T)) / fps, T, (*[WALKED] * (at + 1), *names, *rest))
+    return BlindWalk(np.arange(len(T)) / fps, T, (*[WALKED] * (at + 1), *names, *rest), blind.exposure_s)
 
 
 def exposed(T_world_cam: Array, k: int, fps: float, exposure_s: float, count: int = 7) -> list[Array]:

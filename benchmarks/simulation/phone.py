@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.simulation.blind import DARK, TURN, WALKED, BlindSettings, BlindWalk, blind_walk, exposed
+from benchmarks.simulation.blind import DARK, TURN, WALKED, BlindWalk, exposed
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera, Frame
 from list3r.frames.writers.record3d import Record3dWriter
@@ -137,29 +137,27 @@ def write_phone_walk(
     walk: WalkSettings,
     lidar: LidarSettings | None = None,
     drift: DriftSettings | None = None,
-    blind: BlindSettings | None = None,
+    way: BlindWalk | None = None,
 ) -> Path:
     """Film a walk into `folder`: `walk.r3d`, and beside it `groundtruth.txt` and `truth.json`.
 
-    With `blind` it has stretches where the camera cannot be followed; `stretches.json` has the name of each frame's.
+    `way` is the walk with stretches where the camera cannot be followed; `stretches.json` has the name of each frame's.
     """
     lidar, drift = lidar or LidarSettings(), drift or DriftSettings()
     folder.mkdir(parents=True, exist_ok=True)
     camera = walk.camera()
     small = Camera(*DEPTH_SIZE, *_shrunk(camera))
-    if blind is None:
+    if way is None:
         times, poses = walk.poses()
         way = BlindWalk(times, poses, (WALKED,) * len(times))
-    else:
-        way = blind_walk(walk, blind)
     given = drifted(way.T_world_cam, drift, walk.seed)
     pictures, depths = Renderer(walk.world(), camera), Renderer(walk.world(), small)
     seen: dict[int, dict[str, int]] = {}
     out = Record3dWriter(folder, camera, walk.path.fps)
     for k, (T_world_cam, stretch) in enumerate(zip(way.T_world_cam, way.stretch, strict=True)):
         drawn, time_s = pictures.render(T_world_cam), float(way.time_s[k])
-        if stretch == TURN and blind is not None:
-            during = exposed(way.T_world_cam, k, walk.path.fps, blind.exposure_s)
+        if stretch == TURN:
+            during = exposed(way.T_world_cam, k, walk.path.fps, way.exposure_s)
             drawn = replace(drawn, color=np.mean([pictures.render(T).color for T in during], axis=0, dtype=np.float32))
         elif stretch == DARK:
             drawn = replace(drawn, color=np.zeros_like(drawn.color), ids=np.zeros_like(drawn.ids))

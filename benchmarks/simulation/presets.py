@@ -17,7 +17,7 @@ from benchmarks.simulation.takes import Shot, Take
 from benchmarks.simulation.video import MoverTruth, SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
-from list3r.simulation.walk import PathSettings, looking_at
+from list3r.simulation.walk import PathSettings, look_poses
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
@@ -232,7 +232,7 @@ def _jump(take: Take) -> Director:
         view = _near_view(take, director, poses, int(frame))
         if view is None:
             continue
-        then = looking_at((*view.xy, take.eye_m), view.targets[0])[None]
+        then = _looking_at((*view.xy, take.eye_m), view.targets[0])[None]
         if glimpse.common(then, now, 180.0).max() > 0:
             continue
         best = best or view
@@ -359,3 +359,10 @@ _PRESETS: dict[str, _Preset] = {
     "corridor": (_long, _film_corridor, PathSettings(_FPS, 0.65, 45.0)),
 }
 """Which building, which way, which pace at most."""
+
+
+def _looking_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return T_world_cam of an upright camera at `eye` that looks at `target`, metres. Shape (4, 4)."""
+    x, y, z = np.array(target) - np.array(eye)
+    angles = [np.array([a]) for a in (np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), 0.0)]
+    return np.asarray(look_poses(np.array([eye]), *angles)[0])

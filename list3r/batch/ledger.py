@@ -77,7 +77,7 @@ class Ledger:
         except sqlite3.Error as error:
             self._lock.release()
             raise MemoryFileError(
-                f"{path} is no manifest of a batch ({error}); move it away or give --state"
+                f"{path} is not the state file of a batch ({error}); move it away or give --state"
             ) from error
 
     def __enter__(self) -> Self:

@@ -43,7 +43,9 @@ class BatchSettings:
         if self.retries < 0:
             raise OptionError(f"--retries {self.retries}: give 0 or more")
         if self.state is None and is_remote(self.out):
-            raise OptionError(f"--out {self.out} is no folder of this machine; say where the manifest is: --state FILE")
+            raise OptionError(
+                f"--out {self.out} is not a folder of this machine; say where the state file goes: --state FILE"
+            )
 
     def ledger(self) -> Path:
         """Return where the manifest is."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.facts import Fact
+from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store
 
 BATCH_KEYS = Fact[tuple[str, ...]]("batch_keys", tuple[str, ...], ())
@@ -45,9 +45,3 @@ def batch_keys(memory: Path) -> tuple[str, ...]:
     """Return the keys of the tasks whose videos are in a published memory. Raises `MemoryFileError`."""
     with Store.open(memory) as store:
         return store.facts[BATCH_KEYS]
-
-
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -57,7 +57,7 @@ def read_text(where: str) -> str:
     except (OSError, UnicodeDecodeError) as error:
         said = getattr(error, "strerror", None) or error
         raise OptionError(
-            f"{where} cannot be read as a manifest: {said}; name a folder, or a file with one video a line"
+            f"{where} cannot be read as a manifest: {said}; name a folder, or a file with one video per line"
         ) from error
 
 
@@ -149,7 +149,7 @@ class Output:
             raise FileExistsError(path)
         fs.put_file(str(file), path)
         if int(fs.info(path)["size"]) != file.stat().st_size:
-            raise OSError(f"only {fs.info(path)['size']} of {file.stat().st_size} bytes have arrived")
+            raise OSError(f"only {fs.info(path)['size']} of {file.stat().st_size} bytes were copied")
 
 
 def part_of(part: Path, target: Path) -> None:

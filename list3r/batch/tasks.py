@@ -61,7 +61,7 @@ def read_tasks(where: str, asked: Asked) -> list[list[BatchTask]]:
     """
     lines = list(_lines(where))
     if not lines:
-        raise OptionError(f"{where} names no video; give a manifest with one a line, or a folder that holds videos")
+        raise OptionError(f"{where} names no video; give a manifest with one video per line, or a folder of videos")
     groups: dict[str, list[BatchTask]] = {}
     said: dict[str, bool] = {}
     for at, fields in lines:
@@ -104,9 +104,9 @@ def _object(text: str, at: str) -> dict[str, Any]:
     try:
         found = parse_json(text)
     except ValueError as error:
-        raise OptionError(f"{at}: {error}; a line is a path or a JSON object") from error
+        raise OptionError(f"{at}: {error}; write a path or a JSON object") from error
     if not isinstance(found, dict):
-        raise OptionError(f"{at}: a line is a path or a JSON object")
+        raise OptionError(f"{at}: write a path or a JSON object")
     return found
 
 
@@ -117,8 +117,9 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
         raise OptionError(f"{at}: {memory!r} cannot be the name of a memory; use letters, digits, - and _")
     try:
         options = asked.options_of(fields)
-    except TypeError:
-        raise OptionError(f"{at}: one of {', '.join(fields)} is no option of a source; see `list3r build -h`") from None
+    except TypeError as error:
+        unknown = next((name for name in fields if repr(name) in str(error)), ", ".join(fields))
+        raise OptionError(f"{at}: {unknown} is no option of a source; see `list3r build -h`") from None
     except List3rError as error:
         raise OptionError(f"{at}: {error}") from error
     settings = [asdict(options), asdict(asked.request), _shaping(asked.run)]

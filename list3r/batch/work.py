@@ -16,11 +16,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from list3r.batch.sealing import batch_keys, file_hash, seal
+from list3r.batch.sealing import batch_keys, seal
 from list3r.batch.storage import Output, fetched, is_remote
 from list3r.batch.tasks import BatchTask
 from list3r.memory.errors import List3rError, MemoryFileError
 from list3r.memory.store.connection import remove_memory
+from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
 from list3r.pipeline.reports import BuildReport, UpdateReport

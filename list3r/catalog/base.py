@@ -109,7 +109,7 @@ def open_backend(url: str, connections: int = 1, *, make: bool = True) -> Backen
         from list3r.catalog.postgres import PostgresBackend
 
         return PostgresBackend(url, connections)
-    raise CatalogError(f"{kind}:// is no catalogue; give postgresql://host/name, or a file such as catalog.sqlite")
+    raise CatalogError(f"{kind}:// is not a catalogue; give postgresql://host/name, or a file such as catalog.sqlite")
 
 
 def wanted_sql(

@@ -89,7 +89,7 @@ class Catalog:
             output.prepare()
             if output.size(kept) is None:
                 if is_remote(str(path)):
-                    raise CatalogError(f"{path} lies in a store already; catalogue it where it is, without --store")
+                    raise CatalogError(f"{path} is in a store already; add it from there, without --store")
                 output.publish(Path(path), kept, replace=False)
             content = read_content(output.place(kept), content.entry.name)
         return self._backend.put(content)
@@ -132,14 +132,14 @@ class Catalog:
         """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
         k, filters = _count(k), filters or CatalogFilters()
         if (point is None) == (instance_id is None):
-            raise OptionError("give a point or an instance to be near to, one of the two")
+            raise OptionError("give a point or an instance, one of the two")
         at = checked_point(point, "point") if point is not None else self._known(memory, instance_id).box.center
         count, own = k + 8, instance_id
         while True:
             entry, near = _of(memory, self._backend.near(printable(memory), at.tolist(), count, filters))
             found = [f for f in _by_distance(near, at) if f[1] != own][:k]
             # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
-            if len(near) < count or (len(found) == k and found[-1][0] <= aabb_distance(near[-1], at)):
+            if len(near) < count or (len(found) == k and found[-1][0] <= near[-1].aabb_distance(at)):
                 break
             count *= 4
         whence = "the point" if own is None else f"the centre of #{own}"
@@ -215,7 +215,7 @@ class Catalog:
         chosen = self._space(memory, space)
         if instance_id is not None:
             if memory is None:
-                raise OptionError("an instance has its number in one memory; name that")
+                raise OptionError("the number of an instance belongs to one memory; name that memory")
             self._known(memory, instance_id)
             asked = self._backend.vector(memory, instance_id, chosen)
             if asked is None:
@@ -246,7 +246,7 @@ class Catalog:
             stored = ", ".join(p for p in ALL_PREDICATES if p not in VIEWPOINT and p != "between")
             raise OptionError(f"predicate {predicate!r} is not one that is stored; choose one of: {stored}")
         if subject is None and object is None and memory is None:
-            raise OptionError("over all memories a subject or an object is needed: words, such as mug")
+            raise OptionError("a question to all memories needs words for the subject or the object, such as mug")
         ends = self._end(subject, memory), self._end(object, memory)
         rows = self._backend.related(memory, ends[0], predicate, ends[1], k)
         by_name = self._by_name(entries, [r[0] for r in rows])
@@ -281,7 +281,7 @@ class Catalog:
         if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):
             return Wanted(tuple(wanted_words(what)))
         if memory is None:
-            raise OptionError(f"{what} has its number in one memory; name that, or give words")
+            raise OptionError(f"the number of {what} belongs to one memory; name that memory, or give words")
         number = int(what.removeprefix("#")) if isinstance(what, str) else what
         return Wanted(instance_id=self._known(memory, number).id)
 
@@ -352,12 +352,6 @@ def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> 
     """Return things with the distance of a point from their boxes and their number, the nearest first."""
     held = zip(box_distances(things, point).tolist(), things, strict=True)
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
-
-
-def aabb_distance(thing: CatalogThing, point: NDArray[np.float64]) -> float:
-    """Return the distance of a point from the axis-aligned box of a thing, 0 inside, world units."""
-    low, high = map(np.array, thing.bounds())
-    return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))
 
 
 def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, told: Sequence[Any]) -> CatalogMatch:

@@ -101,7 +101,9 @@ class PostgresBackend:
                 known = _first(connection.execute(statement, (held.space, dimension)))
                 connection.execute(vector_table(known[0], dimension).encode())
             if known[1] != dimension:
-                raise CatalogError(f"vectors of {dimension} numbers are none of {held.space}, which has {known[1]}")
+                raise CatalogError(
+                    f"vectors of {dimension} numbers do not belong to {held.space}, which has {known[1]}"
+                )
             out.append((int(known[0]), held))
         return out
 
@@ -229,7 +231,9 @@ class PostgresBackend:
     def spaces(self, memory: str | None) -> list[str]:
         """Return the names of spaces that hold vectors. Raises `CatalogError` where the server has no pgvector."""
         if not self.has_vectors:
-            raise CatalogError(f"the server at {self._where} has no pgvector; with it, `list3r catalog rebuild`")
+            raise CatalogError(
+                f"the server at {self._where} has no pgvector; install it and run `list3r catalog rebuild`"
+            )
         known = self._rows("SELECT name, space_id FROM space ORDER BY name", ())
         if memory is None:
             return [str(name) for name, _ in known]
@@ -369,7 +373,9 @@ def _migrated(connection: psycopg.Connection[Any]) -> bool:
     known = _first(connection.execute("SELECT to_regclass('list3r.version')"))[0]
     done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0) if known else 0
     if done > len(MIGRATIONS):
-        raise CatalogError(f"the catalogue has schema {done}, of a newer list3r; this one knows {len(MIGRATIONS)}")
+        raise CatalogError(
+            f"the catalogue has schema {done} of a newer list3r; this one knows up to {len(MIGRATIONS)}; update list3r"
+        )
     if done < len(MIGRATIONS):
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_SCHEMA_LOCK,))
         connection.execute("CREATE SCHEMA IF NOT EXISTS list3r")

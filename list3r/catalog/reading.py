@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from list3r.batch.storage import fetched, is_remote
 from list3r.catalog.records import CatalogError, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.memory.description.words import vocabulary
 from list3r.memory.records import Instance
+from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store
 
 
@@ -19,14 +19,14 @@ def read_content(path: str, name: str | None = None) -> MemoryContent:
     Raises `MemoryFileError` for what is no memory, `CatalogError` for one that is being written.
     """
     if path != printable(path):
-        raise CatalogError(f"{printable(path)} is no text in UTF-8, as a catalogue keeps it; rename the file or folder")
+        raise CatalogError(f"{printable(path)} is not valid UTF-8, which a catalogue needs; rename the file or folder")
     if is_remote(path):
         with tempfile.TemporaryDirectory() as folder:
             local = fetched(path, Path(folder) / "memory")
             return _content(local, path, 0, name)
     local = Path(path).resolve()
     if not local.is_file():
-        raise CatalogError(f"{path} is no file; name a memory, such as house.l3r")
+        raise CatalogError(f"{path} is not a file; name a memory, such as house.l3r")
     return _content(local, str(local), local.stat().st_mtime_ns, name)
 
 
@@ -45,7 +45,7 @@ def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryC
             name,
             path,
             0,
-            _sha256(local),
+            file_hash(local),
             local.stat().st_size,
             mtime_ns,
             store.facts.scale_kind or "relative",
@@ -76,8 +76,3 @@ def _thing(memory: str, i: Instance) -> CatalogThing:
 def printable(text: str) -> str:
     """Return a text without what a database cannot hold: NUL, and halves of characters."""
     return text.replace("\x00", "\ufffd").encode("utf-8", "replace").decode("utf-8")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -71,6 +71,11 @@ class CatalogThing:
         reach = np.abs(self.box.rotation) @ (self.box.size / 2.0)
         return (self.box.center - reach).tolist(), (self.box.center + reach).tolist()
 
+    def aabb_distance(self, point: NDArray[np.float64]) -> float:
+        """Return the distance of a point (3,) from the axis-aligned box, 0 inside, world units."""
+        low, high = map(np.array, self.bounds())
+        return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))
+
     def box_numbers(self) -> list[float]:
         """Return centre, size and rotation of its box, 15 numbers."""
         return [*self.box.center.tolist(), *self.box.size.tolist(), *self.box.rotation.ravel().tolist()]

@@ -62,7 +62,7 @@ class SqliteBackend:
             self._database = sqlite3.connect(path, timeout=30.0, isolation_level=None, check_same_thread=False)
             known = self._database.execute("PRAGMA application_id").fetchone()[0]
             if known not in (0, _APPLICATION_ID) or (known == 0 and self._tables()):
-                raise CatalogError(f"{path} is no catalogue; name another file")
+                raise CatalogError(f"{path} is not a catalogue; name another file")
             if known == 0:
                 self._database.execute("PRAGMA journal_mode = WAL")
                 self._database.executescript(
@@ -163,7 +163,7 @@ class SqliteBackend:
         reach, farthest = 1.0, np.inf
         while True:
             found = self._inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
-            gaps = [_gap(t, at) for t in found]
+            gaps = [t.aabb_distance(at) for t in found]
             if sum(g <= reach for g in gaps) >= k or reach >= farthest:
                 order = sorted(range(len(found)), key=lambda n: (gaps[n], found[n].id))
                 return [found[n] for n in order[:k]]
@@ -273,7 +273,9 @@ class SqliteBackend:
             while some := rows.fetchmany(_BATCH):
                 held = np.frombuffer(b"".join(v for _, v in some), "<f2").reshape(len(some), -1).astype(np.float32)
                 if held.shape[1] != len(unit):
-                    raise CatalogError(f"a vector of {len(unit)} numbers is none of {space}, which has {held.shape[1]}")
+                    raise CatalogError(
+                        f"a vector of {len(unit)} numbers does not belong to {space}, which has {held.shape[1]}"
+                    )
                 both = np.column_stack([held @ unit, [n for n, _ in some]])
                 best = np.concatenate([best, both])
                 best = best[np.lexsort((best[:, 1], -best[:, 0]))[:k]]
@@ -303,7 +305,7 @@ class SqliteBackend:
                 yield
         except sqlite3.Error as error:
             raise CatalogError(
-                f"{self._path} cannot be read: {error}; `list3r catalog rebuild` makes it anew"
+                f"{self._path} cannot be read: {error}; `list3r catalog rebuild` makes a new one"
             ) from error
 
     @contextlib.contextmanager
@@ -365,8 +367,3 @@ def unit_vectors(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return vectors of length one. Shape (N, D)."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float32)
-
-
-def _gap(thing: CatalogThing, point: NDArray[np.float64]) -> float:
-    low, high = map(np.array, thing.bounds())
-    return float(np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0)))

@@ -11,8 +11,9 @@ import importlib
 import os
 import signal
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any
 
 import typer
@@ -44,14 +45,22 @@ MODULES: dict[str, tuple[str, ...]] = {
     "catalog.commands": ("catalog",),
     "serve.service": ("serve",),
 }
-"""The commands that each module of this folder adds; it is imported when one of them is asked for, or the help."""
+"""The commands of each module of this folder; it is imported when one of them is asked for, or the help."""
+FUNCTIONS = {
+    "list": "list_instances",
+    "import": "import_map",
+    "query": "questions",
+    "eval": "measures",
+    "catalog": "catalogue",
+}
+"""Functions and groups of commands that have another name than their command."""
 GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
     "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config", "serve"),
     "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
-    "Hand over": ("export", "catalog"),
-    "Measure": ("eval",),
-    "Keep": ("verify", "repair", "doctor", "models"),
+    "Export": ("export", "catalog"),
+    "Evaluate": ("eval",),
+    "Maintain": ("verify", "repair", "doctor", "models"),
 }
 """What commands are for, in the order of the help."""
 
@@ -110,11 +119,21 @@ def commands(asked: str | None = None) -> Any:
     one = any(asked in names for names in MODULES.values())
     for module, names in MODULES.items():
         if asked in names or not one:
-            importlib.import_module(f"list3r.cli.{module}").register(app)
+            _add(app, importlib.import_module(f"list3r.cli.{module}"), names)
     return typer.main.get_command(app)
 
 
-def _version(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+def _add(app: typer.Typer, module: ModuleType, names: Iterable[str]) -> None:
+    """Add commands of a module to the program."""
+    for name in names:
+        found = getattr(module, FUNCTIONS.get(name, name.replace("-", "_")))
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name)
+        else:
+            app.command(name)(found)
+
+
+def _version(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
     if version:
         from list3r import __version__
 

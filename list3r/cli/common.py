@@ -64,15 +64,15 @@ def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
     """The same command with `--at SESSION`, which `open_memory` obeys while it runs."""
     signature = inspect.signature(command, eval_str=True)
     option = Annotated[
-        int | None, typer.Option("--at", metavar="SESSION", help="The world as it was after this session.")
+        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
     ]
     added = inspect.Parameter("at", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
 
     @functools.wraps(command)
-    def asked(*args: Any, at: int | None = None, **words: Any) -> Any:
+    def asked(*args: Any, at: int | None = None, **values: Any) -> Any:
         before = _AT.set(at)
         try:
-            return command(*args, **words)
+            return command(*args, **values)
         finally:
             _AT.reset(before)
 
@@ -82,15 +82,15 @@ def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def only(*names: str) -> tuple[str, ...]:
-    """Return the fields of a dataclass that a command takes as options: `words: Annotated[BuildRequest, only(...)]`."""
+    """Return the fields of a dataclass that a command takes: `request: Annotated[RunOptions, only(...)]`."""
     return names
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with one option for each field of those of its parameters that are dataclasses of options.
 
-    `words: SourceWords` in its signature stands for all fields of `SourceWords`, in that place and order; a field that
-    is such a dataclass itself stands for its own fields.
+    `source: SourceArguments` in its signature stands for all fields of `SourceArguments`, in that place and order. A
+    field that is such a dataclass itself stands for its own fields.
     """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
@@ -104,9 +104,9 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
         options += groups[name][1]
 
     @functools.wraps(command)
-    def gathered(**words: Any) -> None:
-        given = {n: {p.name: words.pop(p.name) for p in parameters} for n, (_, parameters) in groups.items()}
-        command(**words, **{n: _gathered(group, given[n]) for n, (group, _) in groups.items()})
+    def gathered(**values: Any) -> None:
+        given = {n: {p.name: values.pop(p.name) for p in parameters} for n, (_, parameters) in groups.items()}
+        command(**values, **{n: _gathered(group, given[n]) for n, (group, _) in groups.items()})
 
     gathered.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
     gathered.__annotations__ = {p.name: p.annotation for p in options}

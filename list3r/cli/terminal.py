@@ -1,6 +1,6 @@
 """The one way to the terminal: a line is a line, and shows what it is given without obeying it.
 
-Labels, descriptions, reasons and names of files come from strangers. Control characters, line ends and marks that turn
+Labels, reasons and names of files may come from anybody. Control characters, line ends and marks that turn
 the direction of text are shown escaped, so that nothing forges a row, moves the cursor or hides.
 """
 

@@ -81,7 +81,9 @@ def _step(moved: Array, target: Array, normal: Array, reach: float, with_scale: 
     scaled = hessian / np.outer(units, units)
     values = np.linalg.eigvalsh(scaled)
     if values[0] < least_stiffness * values[-1]:
-        raise DegenerateError("the surfaces leave a motion open (one plane, or a tube): ICP cannot align these clouds")
+        raise DegenerateError(
+            "the surfaces leave a motion undetermined (one plane, or a tube): ICP cannot align these clouds"
+        )
     x = np.zeros(7)
     x[: jacobian.shape[1]] = -np.linalg.solve(hessian, jacobian.T @ (weight * residual))
     about = Sim3(np.ones(()), np.eye(3), middle)

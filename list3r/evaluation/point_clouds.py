@@ -31,13 +31,13 @@ class PointCloud:
     """Finite. Shape (N, 3)."""
     normals: Array | None
     """Unit length. Shape (N, 3); None where they are not known."""
-    words: str = ""
+    text: str = ""
     """Where they come from, for people."""
 
     def moved(self, S_a_b: Sim3) -> PointCloud:
         """Return the cloud of frame b in frame a."""
         normals = None if self.normals is None else self.normals @ S_a_b.rotation.T
-        return PointCloud(S_a_b.apply(self.points), normals, self.words)
+        return PointCloud(S_a_b.apply(self.points), normals, self.text)
 
 
 def read_cloud(path: str | Path) -> PointCloud:
@@ -49,7 +49,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     path = Path(path)
     ending = path.suffix.lower()
     if not path.is_file():
-        raise SourceError(f"{path} does not exist or is no file; give a cloud ({', '.join(ENDINGS)}) or a memory")
+        raise SourceError(f"{path} does not exist or is not a file; give a cloud ({', '.join(ENDINGS)}) or a memory")
     if ending not in ENDINGS:
         raise SourceError(f"{path} ends in {ending or 'nothing'}; give a cloud ({', '.join(ENDINGS)}) or a memory")
     try:
@@ -139,7 +139,7 @@ def thinned(cloud: PointCloud, voxel_m: float, most: int | None = None) -> Point
     if most is not None and len(points) > most:
         rows = np.sort(np.random.default_rng(0).choice(len(points), most, replace=False))
         points, normals = points[rows], None if normals is None else normals[rows]
-    return PointCloud(points, normals, cloud.words)
+    return PointCloud(points, normals, cloud.text)
 
 
 def _cells(points: Array, voxel_m: float) -> NDArray[np.int64]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.exporters.output import part_path
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, FrameRow, Instance, Support
 from list3r.memory.store.store import Store
@@ -52,6 +54,11 @@ def read_components(store: Store) -> list[Component]:
         )
         for k in order
     ]
+
+
+def component_files(store: Store, path: str | Path) -> list[tuple[Path, Component]]:
+    """Return the components, each with the file that it is written to; the main one has `path` itself."""
+    return [(part_path(Path(path), component.name), component) for component in read_components(store)]
 
 
 def thinned_support(store: Store, instance: Instance, limit: int | None) -> Support:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 from pathlib import Path
 
-from list3r.exporters.output import part_path, replacing
+from list3r.exporters.output import part_path, write_together
 from list3r.exporters.tables import COLUMNS, Table, Value, rows_of
 from list3r.memory.store.store import Store
 
@@ -17,16 +16,15 @@ def write_csv(store: Store, path: str | Path) -> tuple[Path, ...]:
     The first row names the columns, see `tables.COLUMNS`. Text is UTF-8; an unknown value is an empty cell. Rows of
     all components are in one table: compare positions only where the column `component` is the same.
     """
-    path = Path(path)
-    tables: dict[Table, Path] = {"instances": path, "relations": part_path(path, "relations")}
-    with contextlib.ExitStack() as stack:
-        for table, target in tables.items():
-            temporary = stack.enter_context(replacing(target))
-            with temporary.open("w", encoding="utf-8", newline="") as file:
-                out = csv.writer(file, lineterminator="\n")
-                out.writerow(COLUMNS[table])
-                out.writerows([_cell(value) for value in row] for row in rows_of(store, table))
-    return tuple(tables.values())
+
+    def write(table: Table, to: Path) -> None:
+        with to.open("w", encoding="utf-8", newline="") as file:
+            out = csv.writer(file, lineterminator="\n")
+            out.writerow(COLUMNS[table])
+            out.writerows([_cell(value) for value in row] for row in rows_of(store, table))
+
+    tables: dict[Path, Table] = {Path(path): "instances", part_path(Path(path), "relations"): "relations"}
+    return write_together(tables.items(), write)
 
 
 def _cell(value: Value) -> Value:

@@ -3,7 +3,6 @@
 # mypy: disable-error-code="no-untyped-call"
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from list3r.exporters.components import Component, has_box, read_components, thinned_support
-from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.components import Component, component_files, has_box, thinned_support
+from list3r.exporters.output import units, write_together
 from list3r.exporters.palette import Color, instance_color, linear_from_srgb, structure_color
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
@@ -50,15 +49,12 @@ def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = Non
     The node `world` above them turns z up into the y up of glTF. Facts of an instance are the `extras` of its geometry.
     Each component is a file of its own, the main one at `path`. Returns the files written.
     """
-    path, settings = Path(path), settings or GlbSettings()
-    written = []
-    with contextlib.ExitStack() as stack:
-        for component in read_components(store):
-            target = part_path(path, component.name)
-            temporary = stack.enter_context(replacing(target))
-            temporary.write_bytes(_glb(store, component, settings))
-            written.append(target)
-    return tuple(written)
+    chosen = settings or GlbSettings()
+
+    def write(component: Component, to: Path) -> None:
+        to.write_bytes(_glb(store, component, chosen))
+
+    return write_together(component_files(store, path), write)
 
 
 def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.exporters.output import part_path, replacing
+from list3r.exporters.output import part_path, write_together
 from list3r.memory.description.printable import shown
 from list3r.memory.search.graphs import merge_graph, relation_graph
 from list3r.memory.store.store import Store
@@ -37,10 +36,7 @@ def write_node_link(store: Store, path: str | Path) -> tuple[Path, ...]:
 
 def _write_both(store: Store, path: Path, write: Write) -> tuple[Path, ...]:
     graphs = {path: relation_graph(store), part_path(path, "merges"): merge_graph(store)}
-    with contextlib.ExitStack() as stack:
-        for target, graph in graphs.items():
-            write(graph, stack.enter_context(replacing(target)))
-    return tuple(graphs)
+    return write_together(graphs.items(), write)
 
 
 def _write_graphml(graph: networkx.Graph, path: Path) -> None:

@@ -7,14 +7,17 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from list3r.memory.errors import ExportError
 
 if TYPE_CHECKING:
     from list3r.memory.store.store import Store
+
+
+T = TypeVar("T")
 
 
 @contextlib.contextmanager
@@ -39,6 +42,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_together(parts: Iterable[tuple[Path, T]], write: Callable[[T, Path], None]) -> tuple[Path, ...]:
+    """Write each part to its file by `write(part, path)`, all of them or none. Returns the files."""
+    written = []
+    with contextlib.ExitStack() as stack:
+        for target, part in parts:
+            write(part, stack.enter_context(replacing(target)))
+            written.append(target)
+    return tuple(written)
 
 
 @contextlib.contextmanager

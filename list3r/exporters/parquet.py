@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 from pathlib import Path
 from typing import Any
 
-from list3r.exporters.output import part_path, replacing
+from list3r.exporters.output import part_path, write_together
 from list3r.exporters.tables import COLUMNS, Table, rows_of
 from list3r.memory.store.store import Store
 
@@ -23,13 +23,9 @@ def write_parquet(store: Store, path: str | Path) -> tuple[Path, ...]:
 
     Columns are those of `tables.COLUMNS`, typed; an unknown value is null. Returns the files written.
     """
-    path = Path(path)
-    tables: dict[Table, Path] = {"instances": path}
-    tables |= {"relations": part_path(path, "relations"), "frames": part_path(path, "frames")}
-    with contextlib.ExitStack() as stack:
-        for table, target in tables.items():
-            _write_table(store, table, stack.enter_context(replacing(target)))
-    return tuple(tables.values())
+    others: tuple[Table, ...] = ("relations", "frames")
+    tables: dict[Path, Table] = {Path(path): "instances", **{part_path(Path(path), name): name for name in others}}
+    return write_together(tables.items(), functools.partial(_write_table, store))
 
 
 def _write_table(store: Store, table: Table, path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.exporters.components import Component, read_components, thinned_support
-from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.components import Component, component_files, thinned_support
+from list3r.exporters.output import units, write_together
 from list3r.exporters.palette import instance_color, structure_color
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
@@ -54,18 +53,15 @@ def write_ply(store: Store, path: str | Path, settings: PlySettings | None = Non
     Comments name the instances, other signs than ASCII escaped as in JSON.
     Each component is a file of its own, the main one at `path`. Returns the files written.
     """
-    path, settings = Path(path), settings or PlySettings()
-    written = []
-    with contextlib.ExitStack() as stack:
-        for component in read_components(store):
-            target = part_path(path, component.name)
-            temporary = stack.enter_context(replacing(target))
-            vertices = _vertices(store, component, settings)
-            with temporary.open("wb") as file:
-                file.write(_header(store, component, len(vertices)).encode("ascii"))
-                file.write(vertices.tobytes())
-            written.append(target)
-    return tuple(written)
+    chosen = settings or PlySettings()
+
+    def write(component: Component, to: Path) -> None:
+        vertices = _vertices(store, component, chosen)
+        with to.open("wb") as file:
+            file.write(_header(store, component, len(vertices)).encode("ascii"))
+            file.write(vertices.tobytes())
+
+    return write_together(component_files(store, path), write)
 
 
 def _vertices(store: Store, component: Component, settings: PlySettings) -> NDArray[Any]:

@@ -150,7 +150,5 @@ def _given(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
     for option in given:
         if option not in form.options:
             others = [n for n, f in FORMATS.items() if option in f.options]
-            raise OptionError(
-                f"{option} goes with {' and '.join(others) or 'no format'}, not with {name}; leave it out"
-            )
+            raise OptionError(f"{option} belongs to {' and '.join(others) or 'no format'}, not to {name}; leave it out")
     return given

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 import numpy as np
 
 from list3r.exporters.components import read_components
-from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.output import part_path, units, write_together
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.records import FrameRow
 from list3r.memory.store.store import Store
@@ -22,17 +21,13 @@ def write_tum(store: Store, path: str | Path) -> tuple[Path, ...]:
     Sessions have clocks of their own and components frames of reference of their own, so each pair of them is one
     trajectory: the longest goes to `path`, the others beside it. Returns the files written.
     """
-    path = Path(path)
     unit = "metres" if units(store) == "m" else "arbitrary units (relative scale)"
-    written = []
-    with contextlib.ExitStack() as stack:
-        for name, poses in _trajectories(store):
-            target = part_path(path, name)
-            temporary = stack.enter_context(replacing(target))
-            header = [f"# T_world_cam, colour camera, OpenCV axes, {unit}, {len(poses)} frames", f"# {_COLUMNS}"]
-            temporary.write_text("\n".join([*header, *_lines(poses)]) + "\n", encoding="utf-8")
-            written.append(target)
-    return tuple(written)
+
+    def write(poses: list[Pose], to: Path) -> None:
+        header = [f"# T_world_cam, colour camera, OpenCV axes, {unit}, {len(poses)} frames", f"# {_COLUMNS}"]
+        to.write_text("\n".join([*header, *_lines(poses)]) + "\n", encoding="utf-8")
+
+    return write_together(((part_path(Path(path), name), poses) for name, poses in _trajectories(store)), write)
 
 
 _COLUMNS = "time_s tx ty tz qx qy qz qw"

@@ -160,3 +160,8 @@ class FrameSource(Protocol):
     def position(self, index: int) -> int:
         """Return where a frame (Frame.index) is among those handed out."""
         ...
+
+
+def index_at(source: FrameSource, position: int) -> int:
+    """Return the number in the source of the frame at a position."""
+    return next((f.index for f in source.read(position, position + 1)), position)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from list3r.frames.base import BadFrame, Frame, FrameSource
 from list3r.frames.options import SourceOptions
+from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import check_bad_share, open_source, require_camera
 from list3r.frames.writers.base import MakeWriter, SequenceWriter
 from list3r.memory.errors import ExportError, OptionError, SourceError
@@ -87,7 +88,7 @@ def convert(
         raise ExportError(f"{target} cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    return report
+    return replace(report, notes=(*report.notes, *disagreements(opened)))
 
 
 def _layout(name: str) -> OutputLayout:

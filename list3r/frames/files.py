@@ -1,4 +1,4 @@
-"""Files that strangers wrote: only ordinary ones of a sane size are read, and pictures that fit in memory."""
+"""Files of unknown origin: only ordinary ones of a sane size are read, and pictures that fit in memory."""
 
 from __future__ import annotations
 

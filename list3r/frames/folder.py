@@ -48,6 +48,9 @@ _MOST_OFF_CENTRE = 0.2
 NOWHERE_SURE = "the sensor is sure of no depth that was looked at; is `confidence` of this recording?"
 
 
+NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not taken over"
+
+
 class FolderSource:
     """A `FrameSource` over files; nothing is kept between frames."""
 
@@ -68,7 +71,8 @@ class FolderSource:
         self._typical_raw = 0.0
         self._floats, self._bits = False, 16
         sizes = self._probe(root)
-        if self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0):
+        fractions = self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0)
+        if fractions and self._typical_raw <= _MOST_M:  # larger numbers with fractions are in the layout's unit
             self.optics = optics = replace(optics, depth_scale=1.0)
             notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale says otherwise")
         self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side)
@@ -147,11 +151,18 @@ class FolderSource:
         if self._has_depth:
             if file.depth is None:
                 raise FrameError(f"{file.color.name} has no depth image")
-            depth = self._rig.depth(self._sure(read_raw_depth(file.depth), file))
+            depth = self._rig.depth(self._sure(read_raw_depth(file.depth), file), file.lens)
             if file.mask is not None:
-                shown = cv2.resize(read_gray(file.mask, 1), depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-                depth = np.where(shown > 0, depth, np.float32(0.0))
+                depth = np.where(self._shown(file.mask, depth.shape), depth, np.float32(0.0))
         return Frame(number, self._time_s(number, file), color, depth, self._pose(file))
+
+    def _shown(self, mask: Stored, size: tuple[int, ...]) -> NDArray[np.bool_]:
+        """Return where a mask lets a picture count. Shape `size`."""
+        gray = read_gray(mask, 1)
+        height, width = gray.shape
+        if abs(width * size[0] - height * size[1]) > 0.02 * height * size[1]:
+            raise FrameError(f"{mask.name} is {width}x{height}, of another shape than its picture")
+        return np.asarray(cv2.resize(gray, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT) > 0)
 
     def _color(self, file: FrameFile) -> NDArray[np.uint8]:
         """Return the picture as stored, upright where that is asked for. Shape (H, W, 3)."""
@@ -209,6 +220,7 @@ class FolderSource:
             *self._scale_doubts(),
             *self._depth_doubts(),
             *self._pose_doubts(),
+            *self._count_doubts(),
             *self._time_doubts(),
             *self._camera_doubts(),
         )
@@ -279,6 +291,16 @@ class FolderSource:
             return ()
         return (f"{wrong} of {len(some)} poses looked at are no rigid motion (mirrored, stretched or not finite)",)
 
+    def _count_doubts(self) -> tuple[str, ...]:
+        """Return how many frames lack a pose or a depth image that others have."""
+        files = self._layout.files
+        total = len(files)
+        posed, deep = len(files.that_hold(POSE_FILE | POSE)), len(files.that_hold(DEPTH))
+        return (
+            *((without_pose(total - posed, total),) if 0 < posed < total else ()),
+            *((without_depth(total - deep, total),) if self._has_depth and deep < total else ()),
+        )
+
     def _time_doubts(self) -> tuple[str, ...]:
         if self._clock:
             return ()
@@ -298,6 +320,8 @@ class FolderSource:
             notes = (*notes, f"of the 16 bits of the pictures {self._bits} are in use, which count as full brightness")
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration
+        if layout.z_up and turns is None and len(layout.files.that_hold(POSE_FILE | POSE)):
+            notes = (*notes, NOT_STANDING)
         notes = (*notes, *lying_note(turns or 0))
         return SourceInfo(
             kind=layout.kind,
@@ -333,6 +357,16 @@ class FolderSource:
         picture = self._first_picture
         focal = exif_focal(picture) if self._rig.camera is None and isinstance(picture, Path) else None
         return None if focal is None else centred_camera(focal, self._rig)
+
+
+def without_pose(count: int, total: int) -> str:
+    """That some frames have no pose, for people."""
+    return f"{count} of {total} frames come without a pose"
+
+
+def without_depth(count: int, total: int) -> str:
+    """That some frames have no depth image, for people."""
+    return f"{count} of {total} frames come without a depth image and cannot be used"
 
 
 def centred_camera(focal: float, rig: Rig) -> Camera:

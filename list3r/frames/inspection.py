@@ -21,6 +21,8 @@ class SourceReport:
     calibration: DepthCalibration | None = None
     overlay: Path | None = None
     """The picture of depth edges over colour that was written."""
+    wrong: tuple[str, ...] = ()
+    """How poses, depth and camera contradict each other: a build that uses the poses is refused."""
 
     def as_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
@@ -44,6 +46,7 @@ class SourceReport:
             "fingerprint": info.fingerprint,
             "notes": list(info.notes),
             "missing": list(info.missing),
+            "wrong": list(self.wrong),
         }
         if self.calibration is not None:
             report["calibration"] = self.calibration.as_dict()
@@ -64,6 +67,7 @@ class SourceReport:
             f"vertical     {_vertical_text(info)}",
             *(f"note         {note}" for note in info.notes),
             *(f"missing      {what}" for what in info.missing),
+            *(f"wrong        {what}; build refuses such poses (--poses estimate does without)" for what in self.wrong),
             *([] if self.calibration is None else _calibration_lines(self.calibration)),
             *([] if self.overlay is None else [f"overlay      {self.overlay}"]),
         ]

@@ -48,6 +48,10 @@ class Optics:
     """(height, width) of the images that `depth_intrinsics` are stated for; None for depth as stored."""
     fisheye: bool = False
     """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4)."""
+    shares_view: bool = False
+    """Depth is of the colour camera itself, if at another size; `depth_intrinsics` say otherwise."""
+    said: bool = False
+    """`intrinsics` are the user's word, not that of a file: a centre far from the middle is taken as it is."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,24 @@ class FolderLayout:
     """Whether given poses were followed as the recording went on and never put right: they drift, and may jump."""
     upright_tags: bool = True
     """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
+
+
+VARIES = 0.003
+"""Frames whose focal lengths differ by a larger share have each a camera of its own; 1 % is a centimetre 2 m away."""
+
+
+def varies_note(spread: float, carried: bool) -> str:
+    """Return what is said of frames whose focal lengths differ by a share."""
+    what = "every frame is carried to one camera" if carried else "one camera serves all of them"
+    return f"focal lengths of frames differ by {100 * spread:.1f} %: {what}"
+
+
+def own_camera(stated: Sequence[float], where: Path) -> Camera:
+    """Return the camera of one frame from fx, fy, cx, cy, width, height. Raises `SourceError`."""
+    try:
+        return Camera(round(stated[4]), round(stated[5]), *check_intrinsics(stated[:4]))
+    except (ValueError, OptionError) as error:
+        raise SourceError(f"{where}: {error}") from None
 
 
 def usual_camera(cameras: Sequence[Camera]) -> Camera:

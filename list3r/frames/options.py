@@ -51,7 +51,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """All that can be said about a source; what is left out is found in the source or known for its layout."""
+    """What is known of a source. What is left out is read from the source or known for its layout."""
 
     kind: str = "auto"
     """One of `KINDS`."""
@@ -74,10 +74,10 @@ class SourceOptions:
     depth_scale: float | None = None
     """Stored depth units per metre."""
     topics: tuple[tuple[str, str], ...] | None = None
-    """Of a ROS recording: (role, topic) with the roles color, depth and pose; what is not said is what fits. Of a
-    data set of LeRobot: (role, key of a camera)."""
+    """For a ROS recording (role, topic) with the roles color, depth and pose; by default those that fit. For a LeRobot
+    data set (role, key of a camera)."""
     fps: float | None = None
-    """Frames per second: of a source with a clock so many are handed out, of one without this is the rate."""
+    """Frames per second to hand out; for a source without a clock, the rate it was filmed at."""
     max_depth_m: float | None = None
     """Depth beyond this counts as unknown, metres."""
     start_s: float | None = None
@@ -85,14 +85,14 @@ class SourceOptions:
     end_s: float | None = None
     """Hand out frames before this time, seconds after the source's first frame."""
     sharpest: bool | None = None
-    """Of each so many frames hand out the sharpest instead of the first; None: for videos only."""
+    """Hand out the sharpest frame of each group instead of the first; None: for videos only."""
     max_side: int | None = None
     """Longest side of the frames handed out, px; larger pictures are reduced. 0 for as stored; None: 960, 1280 with
     depth. Intrinsics are given for pictures as stored."""
     more: tuple[str, ...] | None = None
     """Further video files of the same recording, in order."""
     episode: int | None = None
-    """Of a data set of LeRobot: the episode's number."""
+    """Number of the episode of a LeRobot data set."""
 
     def check_fits(self, info: SourceInfo) -> None:
         """Raise `OptionError` for what is said of a depth camera that the source has not got."""
@@ -213,7 +213,7 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
     """
     words = _file_text(text)
     if words is None and _names_a_file(text):
-        raise OptionError(f"{name} {text!r}: there is no such file, and it is no row of numbers such as tx,ty,tz")
+        raise OptionError(f"{name} {text!r}: there is no such file, and it is not a row of numbers such as tx,ty,tz")
     v = np.array(parse_numbers(words or text, name))
     matrix = np.eye(4)
     if len(v) in (12, 16):

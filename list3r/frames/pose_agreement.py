@@ -1,8 +1,9 @@
-"""Whether given poses fit the depth of the frames: depth of one frame, seen from another, must meet its depth.
+"""Whether given poses fit what the frames show: depth of one frame, seen from another, must meet its depth.
 
 Recorders differ in the axes of a camera and in which way a pose leads; a wrong guess still runs, and makes a world of
 nonsense. What fits far better in another convention is told apart here from poses that merely drift. So is depth in
-another unit: where the camera moves by known metres, what it sees moves by as many pixels as it is far.
+another unit: where the camera moves by known metres, what it sees moves by as many pixels as it is far. Without depth,
+corners that are found again must lie on the lines that the poses leave them. `disagreements` is all of it in words.
 """
 
 from __future__ import annotations
@@ -24,8 +25,12 @@ class AgreementSettings:
 
     pairs: int = 6
     """Pairs of frames that are looked at, spread over the source."""
-    gaps: tuple[int, ...] = (1, 4, 12, 30)
-    """Frames between the two of a pair; the first gap over which the camera has moved enough."""
+    gaps: tuple[int, ...] = (1, 2, 4, 8, 16, 30)
+    """Frames between the two of a pair; the first gap over which the camera has moved well, else the last that will do.
+    """
+    good_turn_deg: float = 10.0
+    """Motion that tells a wrong camera, too, or"""
+    good_shift_m: float = 0.2
     least_turn_deg: float = 4.0
     """Motion that tells conventions apart, or"""
     least_shift_m: float = 0.08
@@ -52,38 +57,127 @@ class AgreementSettings:
     """Another convention is meant where at least this share agrees in it,"""
     gain: float = 0.2
     """and so much more than as the poses are read: neighbours agree by half in any convention."""
+    fits: float = 0.75
+    """Poses, depth and camera contradict each other where a smaller share agrees: 0.93 and more does of recordings that
+    are right or drift, under 0.3 with the camera of another size, 0.63 with one 1.3 times too long (0154)."""
+    least_fits: int = 3
+    """Pairs that must tell so."""
+    rigid: float = 0.4
+    """Of the matches of two pictures without depth this share must fit one motion of the camera, or nothing is told."""
+    good_lines: float = 0.5
+    """As `good`, of corners near the lines that poses leave them; some matches are always false."""
+    fits_lines: float = 0.15
+    """As `fits`: of COLMAP's own poses 0.6 to 0.9 lie there, of others under 0.05."""
 
 
 CONVENTIONS = {
     "as they are read": lambda T: T,
     "with the camera's y and z turned round (OpenGL against OpenCV)": lambda T: T @ OPENGL_TO_OPENCV,
-    "led the other way (world to camera)": np.linalg.inv,
-    "led the other way and turned round": lambda T: np.linalg.inv(T) @ OPENGL_TO_OPENCV,
+    "inverted (world to camera)": np.linalg.inv,
+    "inverted and turned round (world to camera, OpenGL)": lambda T: np.linalg.inv(T) @ OPENGL_TO_OPENCV,
 }
 """What a pose may have been meant as; the first is what the reader makes of it."""
 
 
-def wrong_convention(source: FrameSource, settings: AgreementSettings | None = None) -> str | None:
-    """Return in which convention the poses of a source fit its depth, where that is not the one they are read in.
+Pair = tuple[Frame, Frame]
 
-    None where they fit, or where it cannot be told: without depth, without motion, or when nothing fits.
+
+def disagreements(source: FrameSource, settings: AgreementSettings | None = None) -> tuple[str, ...]:
+    """Return how given poses, depth and camera contradict each other, a sentence each; nothing where they agree.
+
+    Nothing, too, where it cannot be told: without poses or motion, or where the frames show too little.
     """
     s, info = settings or AgreementSettings(), source.info
-    if not (info.has_depth and info.has_poses and info.camera is not None and info.poses_metric):
+    if not info.has_poses or info.camera is None:
+        return ()
+    pairs = _pairs(source, s)
+    shares = _shares(pairs, info.camera, s)
+    found = _best(shares, s)
+    if found is not None:
+        what = "depth" if info.has_depth else "pictures"
+        return (
+            f"the poses do not fit the {what} as they are read, but do {found}: whoever wrote them meant another "
+            "convention",
+        )
+    factor = _factor(source, pairs, s)
+    if factor is not None:
+        return (_factor_text(factor, info.depth_scale),)
+    stated = shares["as they are read"]  # without common view there is nothing to meet
+    return _misfit([v for v in stated if v > 0] if info.has_depth else stated, info.has_depth, s)
+
+
+def _misfit(shares: list[float], has_depth: bool, s: AgreementSettings) -> tuple[str, ...]:
+    """Return what to say of poses that fit in no convention."""
+    least = s.fits if has_depth else s.fits_lines * s.good / s.good_lines
+    if len(shares) < s.least_fits or float(np.median(shares)) >= least:
+        return ()
+    if not has_depth:
+        return (
+            "hardly a corner lies in one picture where the given poses let it be by another: poses or the camera's "
+            "intrinsics are not of these pictures",
+        )
+    return (
+        f"of the depth of one frame, seen from another by the given poses, {100 * np.median(shares):.0f} % meets the "
+        "depth there (of recordings that fit, over 90 %): poses, depth or the camera's intrinsics are not of this "
+        "recording",
+    )
+
+
+def wrong_convention(source: FrameSource, settings: AgreementSettings | None = None) -> str | None:
+    """Return in which convention the poses of a source fit what it shows, where that is not the one they are read in.
+
+    None where they fit, or where it cannot be told: without motion, or when nothing fits.
+    """
+    s, info = settings or AgreementSettings(), source.info
+    if not info.has_poses or info.camera is None:
         return None
-    shares: dict[str, list[float]] = {name: [] for name in CONVENTIONS}
-    for start in np.linspace(0, max(0, info.frame_count - 2), s.pairs).astype(int).tolist():
-        pair = _pair(source, start, s)
-        if pair is None:
+    return _best(_shares(_pairs(source, s), info.camera, s), s)
+
+
+def _shares(pairs: list[Pair], camera: Camera, s: AgreementSettings) -> dict[str, list[float]]:
+    """Return for each convention the share of each pair that agrees."""
+    out: dict[str, list[float]] = {name: [] for name in CONVENTIONS}
+    for pair in pairs:
+        matched = None if pair[0].depth is not None else _matches(*pair, s)
+        if matched is not None and not _moves_as_one(matched, camera, s):
             continue
         for name, change in CONVENTIONS.items():
-            share = _share(*pair, [change(f.T_source_cam) for f in pair], info.camera, s)
-            shares[name].append(share)
+            poses = [change(f.T_source_cam) for f in pair]
+            near = _share(*pair, poses, camera, s) if matched is None else _on_lines(matched, poses, camera, s)
+            out[name].append(near)
+    return out
+
+
+def _moves_as_one(
+    matched: tuple[NDArray[np.float64], NDArray[np.float64]], camera: Camera, s: AgreementSettings
+) -> bool:
+    """Return whether most matches fit one motion of the camera, whichever."""
+    import cv2
+
+    if len(matched[0]) < s.least_matches:
+        return False
+    _, mask = cv2.findEssentialMat(*matched, camera.matrix(), cv2.RANSAC, 0.999, s.epipolar_px)
+    return mask is not None and float((mask > 0).mean()) >= s.rigid
+
+
+def _best(shares: dict[str, list[float]], s: AgreementSettings) -> str | None:
+    """Return the convention that fits far better than the one that poses are read in."""
     if len(shares["as they are read"]) < min(2, s.pairs):
         return None
     middle = {name: float(np.median(found)) for name, found in shares.items()}
-    stated, best = next(iter(middle.values())), max(middle, key=lambda name: middle[name])
+    stated, best = middle["as they are read"], max(middle, key=lambda name: middle[name])
     return best if middle[best] >= max(s.good, stated + s.gain) else None
+
+
+def _on_lines(
+    matched: tuple[NDArray[np.float64], NDArray[np.float64]], poses: list[Pose], camera: Camera, s: AgreementSettings
+) -> float:
+    """Return the share of matches that lie on the lines that poses leave them, as if all were `good_lines` at best."""
+    r, q = (_rays(xy, camera) for xy in matched)
+    T_b_a = np.linalg.inv(poses[1]) @ poses[0]
+    line = np.cross(T_b_a[:3, 3], r @ T_b_a[:3, :3].T)
+    off = np.abs((q * line).sum(axis=1)) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
+    return float((off * camera.fx < s.epipolar_px).mean()) * s.good / s.good_lines
 
 
 def depth_factor(source: FrameSource, settings: AgreementSettings | None = None) -> float | None:
@@ -92,11 +186,14 @@ def depth_factor(source: FrameSource, settings: AgreementSettings | None = None)
     Infinite where depth falls with what they say, as disparity does. None where it is near 1, or where it cannot be
     told: without depth, metric poses or motion, or where matches disagree.
     """
-    s, info = settings or AgreementSettings(), source.info
+    s = settings or AgreementSettings()
+    return _factor(source, _pairs(source, s), s)
+
+
+def _factor(source: FrameSource, pairs: list[Pair], s: AgreementSettings) -> float | None:
+    info = source.info
     if not (info.has_depth and info.has_poses and info.camera is not None and info.poses_metric):
         return None
-    starts = np.linspace(0, max(0, info.frame_count - 2), s.pairs).astype(int).tolist()
-    pairs = [pair for start in starts if (pair := _pair(source, start, s)) is not None]
     stated, factors = np.concatenate([np.zeros((2, 0)), *(_factors(*p, info.camera, s) for p in pairs)], axis=1)
     if len(factors) < s.least_matches:
         return None
@@ -158,24 +255,28 @@ def _rays(xy: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     return np.column_stack([flat, np.ones(len(flat))])
 
 
-def scale_doubts(source: FrameSource, settings: AgreementSettings | None = None) -> tuple[str, ...]:
-    """Return what to say of depth in another unit than its poses, nothing where they agree or it cannot be told."""
-    factor = depth_factor(source, settings)
-    if factor is None:
-        return ()
+def _factor_text(factor: float, units: float | None) -> str:
+    """Return what to say of depth in another unit than its poses."""
     if np.isinf(factor):
-        return (
-            "depth grows where the motion of what is seen says that things are nearer: is it disparity (1 / depth)?",
-        )
+        return "depth grows where the motion of what is seen says that things are nearer: is it disparity (1 / depth)?"
     how = f"{factor:.2g} times as far away" if factor > 1 else f"{1 / factor:.2g} times as near"
-    units = source.info.depth_scale
     fix = "" if units is None else f": --depth-scale {float(f'{units / factor:.2g}'):g} would fit, it is {units:g}"
-    return (f"between the given poses the motion of what is seen is that of things {how} as depth says{fix}",)
+    return (
+        f"between the given poses the motion of what is seen is that of things {how} as depth says{fix} (where the "
+        "poses are in metres)"
+    )
 
 
-def _pair(source: FrameSource, start: int, s: AgreementSettings) -> tuple[Frame, Frame] | None:
-    """Two frames with depth and pose between which the camera moved enough."""
-    first = _whole(source, start)
+def _pairs(source: FrameSource, s: AgreementSettings) -> list[Pair]:
+    """Return pairs of frames spread over the source, between which the camera moved."""
+    starts = np.linspace(0, max(0, source.info.frame_count - 2), s.pairs).astype(int)
+    found = (_pair(source, start, s) for start in np.unique(starts).tolist())
+    return [pair for pair in found if pair is not None]
+
+
+def _pair(source: FrameSource, start: int, s: AgreementSettings) -> Pair | None:
+    """Return two frames with pose, and depth where there is any, between which the camera moved well, or enough."""
+    first, will_do = _whole(source, start), None
     for gap in s.gaps if first is not None else ():
         if start + gap >= source.info.frame_count:
             break
@@ -185,16 +286,20 @@ def _pair(source: FrameSource, start: int, s: AgreementSettings) -> tuple[Frame,
         assert first.T_source_cam is not None and other.T_source_cam is not None
         step = np.linalg.inv(first.T_source_cam) @ other.T_source_cam
         turn = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
-        if turn >= s.least_turn_deg or np.linalg.norm(step[:3, 3]) >= s.least_shift_m:
+        shift = np.linalg.norm(step[:3, 3]) if source.info.poses_metric else 0.0
+        if turn >= s.good_turn_deg or shift >= s.good_shift_m:
             return first, other
-    return None
+        if turn >= s.least_turn_deg or shift >= s.least_shift_m:
+            will_do = first, other
+    return will_do
 
 
 def _whole(source: FrameSource, position: int) -> Frame | None:
     frame = next(iter(source.read(position, position + 1)), None)
-    if not isinstance(frame, Frame) or frame.depth is None or frame.T_source_cam is None:
+    if not isinstance(frame, Frame) or frame.T_source_cam is None:
         return None
-    return frame
+    blank = frame.depth is None or not frame.depth.any()
+    return None if source.info.has_depth and blank else frame
 
 
 def _share(a: Frame, b: Frame, poses: list[Pose], camera: Camera, s: AgreementSettings) -> float:

@@ -53,6 +53,20 @@ FILES: dict[str, tuple[str, Callable[[Path, SourceOptions], FolderLayout]]] = {
 
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 _OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
+_NO_PICTURES = (
+    "confidence",
+    "depth",
+    "depths",
+    "mask",
+    "masks",
+    "ids",
+    "lowres_depth",
+    "semantic",
+    "normal",
+    "normals",
+)
+"""Folders whose pictures are none of a room."""
+_SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _WANTED = (
     "give a video file, a recording of Record3D (.r3d), Stray Scanner, Polycam or ScanNet (.sens), a ROS bag or mcap, "
     "a recording of Aria (.vrs), a data set of LeRobot, "
@@ -98,7 +112,7 @@ def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
     """Open several video files as one. Raises `SourceError` for anything else."""
     for path in paths:
         if not path.is_file() or path.suffix.lower() in (*IMAGE_ENDINGS, *FILES):
-            raise SourceError(f"{path} is no video file; only video files of one recording can be given together")
+            raise SourceError(f"{path} is not a video file; only video files of one recording can be given together")
         if not os.access(path, os.R_OK) or path.stat().st_size == 0:
             raise SourceError(f"{path} is empty or may not be read; check the copy and its permissions")
     from list3r.frames.readers.joined import JoinedVideos
@@ -131,6 +145,12 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
         return stray.open_recording(root, options)
     if options.kind in ("auto", "scannetpp") and scannetpp.is_recording(root):
         return scannetpp.open_scan(root, options)
+    splits = [name for name in _SPLITS if (root / name).is_file()]
+    if options.kind in ("auto", "nerfstudio") and splits and not (root / "transforms.json").is_file():
+        raise SourceError(
+            f"{root} states its poses in {', '.join(splits)}; put their frames into one transforms.json, or say --kind "
+            "images to take colour alone"
+        )
     for kind, find in FOLDERS.items():
         if options.kind in ("auto", kind):
             layout = find(root, options)
@@ -144,7 +164,8 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
         raise SourceError(
             f"{root} holds pictures like {pictures}, which cannot be read here; convert them to JPEG or PNG"
         )
-    inside = next((p for p in sorted(root.iterdir()) if p.is_dir() and images.find(p, options)), None)
+    folders = (p for p in sorted(root.iterdir()) if p.is_dir() and p.name.lower() not in _NO_PICTURES)
+    inside = next((p for p in folders if images.find(p, options)), None)
     if inside is not None and options.kind in ("auto", "images"):
         raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
     said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
@@ -180,8 +201,10 @@ def _open_file(path: Path, options: SourceOptions) -> FrameSource:
         raise SourceError(f"{path} is a file, but the {options.kind} layout is a folder; name the folder")
     if path.suffix.lower() in IMAGE_ENDINGS:
         raise SourceError(f"{path} is one image; name the folder of images or a video")
-    if not path.is_file() or path.stat().st_size == 0:
-        raise SourceError(f"{path} is empty or no ordinary file; {_WANTED}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise SourceError(f"{path} is empty (0 bytes); was the upload finished?")
+    if not path.is_file():
+        raise SourceError(f"{path} is no ordinary file; {_WANTED}")
     if find is not None:
         return FolderSource(path, find(path, options), options)
     if options.kind == "auto" and stray.is_recording(path.parent) and path.name == "rgb.mp4":

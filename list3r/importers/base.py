@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from list3r.frames.files import read_file
 from list3r.memory.errors import SourceError
 from list3r.memory.geometry import OrientedBox
+from list3r.memory.store.facts import Fact
+from list3r.memory.store.store import Store
 from list3r.memory.unpacking import parse_json
 
 MOST_BYTES = 2**30
@@ -21,6 +23,23 @@ _LEAST_POINTS = 1000
 _SPACING_M = 0.02
 GRAY = (160, 160, 160)
 """Colour of points that have none."""
+
+
+IMPORTED = Fact[dict[str, Any] | None]("imported", dict, None)
+"""Where an imported map comes from: `format`, `path`, `notes`, and `names`, what the map calls each local instance."""
+
+
+def imported_as(store: Store, instance_id: int) -> dict[str, Any] | None:
+    """Return `format` and `path` of the map that an instance was imported from, and the `names` that it has there.
+
+    None for an instance that was built.
+    """
+    told = store.facts[IMPORTED]
+    if told is None:
+        return None
+    first = min(chunk.chunk_id for chunk in store.chunks.all())  # the map itself; later ones are of videos
+    names = [told["names"][o.local_id] for o in store.observations.of(instance_id) if o.chunk_id == first]
+    return {"format": told["format"], "path": told["path"], "names": names} if names else None
 
 
 @dataclass(frozen=True)

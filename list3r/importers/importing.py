@@ -10,21 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r import __version__
-from list3r.importers.base import GRAY, ImportedMap, ImportedThing
+from list3r.importers.base import GRAY, IMPORTED, ImportedMap, ImportedThing
 from list3r.importers.registry import read_map
+from list3r.importers.standing import doubt_of_up
 from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.memory.store.connection import remove_memory
-from list3r.memory.store.facts import Fact
 from list3r.memory.store.file import taken
 from list3r.memory.store.store import Store
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.settings import BuildSettings
 
-IMPORTED = Fact[dict[str, Any] | None]("imported", dict, None)
-"""Where an imported map comes from: `format`, `path`, `notes`, and `names`, what the map calls each local instance."""
 _MOST_THINGS = 100_000
 _TURNS = {"x": (0, 1), "y": (1, 1), "z": (2, 1), "-x": (0, -1), "-y": (1, -1), "-z": (2, -1)}
 _SURE = 0.98
@@ -65,7 +63,7 @@ def import_map(path: str | Path, memory: str | Path, *, kind: str = "auto", up: 
         raise OptionError(f"{source} holds {len(found.things)} things; at most {_MOST_THINGS} are imported")
     store = Store.create(target)
     try:
-        report = _write(store, source, found, upright(up))
+        report = _write(store, source, found, up)
     except BaseException:
         store.close()
         remove_memory(target)
@@ -85,7 +83,7 @@ def upright(up: str) -> NDArray[np.float64]:
     return R
 
 
-def _write(store: Store, source: Path, found: ImportedMap, R: NDArray[np.float64]) -> ImportReport:
+def _write(store: Store, source: Path, found: ImportedMap, up: str) -> ImportReport:
     library = ConsolidationSettings(evidence=EvidenceSettings(min_frames=0, least_confidence=0.0))
     settings = BuildSettings(reconstruction="precomputed", poses="given", up="source", library=library)
     with store.transaction():
@@ -101,11 +99,11 @@ def _write(store: Store, source: Path, found: ImportedMap, R: NDArray[np.float64
             "names": [t.name for t in found.things],
         }
         session = store.sessions.add(str(source.resolve()), found.format, settings.as_plain(), 1)
-    add_chunk(store, session, _chunk(found, R), settings=settings.association)
+    add_chunk(store, session, _chunk(found, upright(up)), settings=settings.association)
     finish_session(store, session, settings.association)
     names = {t.name for t in found.things}
     ids = {found.things[o.local_id].name: o.instance_id for o in store.observations.all()}
-    notes = found.notes
+    notes = (*found.notes, *doubt_of_up([t.points for t in found.things], up))
     if len(names) < len(found.things):
         notes = (*notes, "several things of the map have one name")
     left = len(found.things) - len(store.observations.all())
@@ -140,8 +138,9 @@ def _chunk(found: ImportedMap, R: NDArray[np.float64]) -> ChunkResult:
 
 
 def _local(number: int, thing: ImportedThing, R: NDArray[np.float64], size: int) -> LocalInstance:
-    points = thing.points[np.isfinite(thing.points).all(axis=1)] @ R.T.astype(np.float32)
-    rgb = np.tile(np.array(GRAY, np.uint8), (len(points), 1)) if thing.rgb is None else thing.rgb[: len(points)]
+    finite = np.isfinite(thing.points).all(axis=1)
+    points = thing.points[finite] @ R.T.astype(np.float32)
+    rgb = np.tile(np.array(GRAY, np.uint8), (len(points), 1)) if thing.rgb is None else thing.rgb[finite]
     feature = np.ones(size, np.float32) if thing.feature is None or len(thing.feature) != size else thing.feature
     return LocalInstance(
         local_id=number,

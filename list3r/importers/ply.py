@@ -28,7 +28,7 @@ def read_vertices(path: Path) -> dict[str, NDArray[np.float64]]:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check the file") from None
     head, found, _ = data[:_MOST_HEADER].partition(b"end_header")
     if not data.startswith(b"ply") or not found:
-        raise SourceError(f"{path} is no PLY file; was it copied whole?")
+        raise SourceError(f"{path} is not a PLY file; was it copied whole?")
     start = len(head) + len(found) + (2 if data[len(head) + len(found) :][:2] == b"\r\n" else 1)
     order, count, fields = _header(path, head.decode("ascii", "replace"))
     kind = np.dtype([(name, order + code) for name, code in fields])
@@ -44,7 +44,7 @@ def read_vertices(path: Path) -> dict[str, NDArray[np.float64]]:
 def points_of(path: Path, rows: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
     """Return places and colours of vertices. Shapes (N, 3). Raises `SourceError` where a file has no places."""
     if not {"x", "y", "z"} <= rows.keys():
-        raise SourceError(f"{path} has no x, y, z; it is no point cloud")
+        raise SourceError(f"{path} has no x, y, z; it is not a point cloud")
     points = np.stack([rows[k] for k in "xyz"], axis=1).astype(np.float32)
     names = next((n for n in (("red", "green", "blue"), ("r", "g", "b")) if set(n) <= rows.keys()), None)
     if names is None:

@@ -31,4 +31,4 @@ def read_map(path: Path, name: str = "auto") -> ImportedMap:
             if not found.things:
                 raise SourceError(f"{path} holds no things ({'; '.join(found.notes) or kind})")
             return found
-    raise SourceError(f"{path} is no map of {', '.join(FORMATS)}; predictions of networks go through `precomputed`")
+    raise SourceError(f"{path} is not a map of {', '.join(FORMATS)}; predictions of networks go through `precomputed`")

@@ -21,6 +21,11 @@ Key = tuple[int, int]
 T = TypeVar("T")
 
 
+def key_name(key: Key) -> str:
+    """Return how a local instance is named in messages and logs: `chunk:local`."""
+    return f"{key[0]}:{key[1]}"
+
+
 @dataclass(frozen=True)
 class Edit:
     """What an operator did to the library."""

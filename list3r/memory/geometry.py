@@ -56,7 +56,7 @@ def rotation_from_quat_wxyz(quat_wxyz: Array) -> Array:
     """Return rotation matrices of quaternions (normalised here). Shape (..., 4) -> (..., 3, 3)."""
     norm = np.linalg.norm(quat_wxyz, axis=-1, keepdims=True)
     if not (norm > 0).all():
-        raise ValueError("a quaternion of zero norm is no rotation")
+        raise ValueError("a quaternion of zero norm is not a rotation")
     w, x, y, z = np.moveaxis(np.asarray(quat_wxyz / norm, dtype=np.float64), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -165,7 +165,7 @@ def umeyama(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = No
     dx, dy = x - mean_x, y - mean_y
     spread = np.linalg.svd(np.sqrt(w)[:, None] * dx, compute_uv=False)
     if spread[1] < 1e-9 + 1e-4 * spread[0]:
-        raise DegenerateError("the correspondences lie on one line and leave the rotation about it open")
+        raise DegenerateError("the correspondences lie on one line, so the rotation about it is undetermined")
     u, d, vt = np.linalg.svd((w[:, None] * dy).T @ dx)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt

@@ -1,4 +1,4 @@
-"""What strangers packed, unpacked within bounds: JSON of a sane size, zip archives whose members do not explode."""
+"""Packed data of unknown origin, within bounds: JSON of a sane size, zip archives whose members do not explode."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def locate(name: str) -> Path:
     parts = split_name(name)
     cached = find_cached(*parts) if parts is not None else None
     if cached is None:
-        raise OptionError(f"the weights {name} are not there any more; see `list3r models list`")
+        raise OptionError(f"the weights {name} are gone; see `list3r models list`")
     return cached.folder
 
 
@@ -118,7 +118,7 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
         from huggingface_hub import constants, snapshot_download
         from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
     except ImportError:
-        raise OptionError("fetching weights needs a package: pip install 'list3r[models]'") from None
+        raise OptionError("downloading weights needs a package: pip install 'list3r[models]'") from None
     name, wanted = weights.repository, revision or weights.revision
     if not _is_known(constants.ENDPOINT):  # told at once; the package would try for half a minute
         raise OptionError(f"{name}@{wanted} cannot be fetched: {NO_NETWORK.format(name=name)}")
@@ -167,7 +167,7 @@ def read_header(file: Path) -> dict[str, Any]:
     with file.open("rb") as stream:
         length = int.from_bytes(stream.read(8), "little")
         if size < 8 or length > min(size - 8, _MAX_HEADER):
-            raise OptionError(f"{file} is no .safetensors file, or is cut off; fetch it again")
+            raise OptionError(f"{file} is not a .safetensors file, or is cut off; fetch it again")
         try:
             header: dict[str, Any] = json.loads(stream.read(length))
             ends = [int(entry["data_offsets"][1]) for key, entry in header.items() if key != "__metadata__"]

@@ -29,7 +29,7 @@ def parse_weights(words: list[str] | None) -> dict[str, str]:
         if not equals or "/" in part:
             part, value = "reconstruction", word
         if part not in PARTS_OF_OPTIONS:
-            raise OptionError(f"--weights {word}: {part} is no part; choose one of {', '.join(PARTS_OF_OPTIONS)}")
+            raise OptionError(f"--weights {word}: {part} is not a part; choose one of {', '.join(PARTS_OF_OPTIONS)}")
         if part in found:
             raise OptionError(f"--weights {word}: the weights of {part} are given twice")
         found[part] = value

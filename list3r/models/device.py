@@ -46,14 +46,16 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 @contextmanager
-def memory_said(what: str) -> Iterator[None]:
+def out_of_memory_reported(what: str) -> Iterator[None]:
     """Turn memory that runs out into an `OptionError` that says for what it was needed."""
     try:
         yield
     except Exception as error:
         if "torch" not in sys.modules or not is_out_of_memory(error):
             raise
-        raise OptionError(f"{what} does not fit into the memory; free it, use another model, or --device cpu") from None
+        raise OptionError(
+            f"{what} does not fit into the GPU memory; free some, use another model, or --device cpu"
+        ) from None
 
 
 def pictures_that_fit(free_mb: float, figures: MemoryFigures, pixels: int) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from list3r.memory.errors import OptionError
 from list3r.models.cache import CONFIG, check_weights
-from list3r.models.device import memory_said
+from list3r.models.device import out_of_memory_reported
 from list3r.models.upstream import first_line
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def load_pretrained(class_name: str, folder: Path, device: torch.device, *, exac
             f"{folder} holds other weights than {class_name} needs: {len(wrong)} of its layers are missing or have "
             f"another shape, first {wrong[0]}"
         )
-    with memory_said(f"the network {folder}"):
+    with out_of_memory_reported(f"the network {folder}"):
         return model.to(device).eval()
 
 

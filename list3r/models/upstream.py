@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from list3r.memory.errors import OptionError
 from list3r.models.cache import SINGLE_FILES, check_weights
 from list3r.models.cards import ModelCard
-from list3r.models.device import memory_said
+from list3r.models.device import out_of_memory_reported
 
 if TYPE_CHECKING:
     import torch
@@ -63,7 +63,7 @@ def load_upstream(cls: Any, path: Path, device: torch.device) -> Any:
     except Exception as error:  # what torch, safetensors and the class raise on foreign weights is not a closed list
         raise OptionError(f"{path} cannot be loaded as {cls.__name__}: {first_line(error)}") from None
     _check_complete(model, names, path)
-    with memory_said(f"the network {path}"):
+    with out_of_memory_reported(f"the network {path}"):
         return model.to(device).eval()
 
 
@@ -99,7 +99,7 @@ def _from_file(cls: Any, file: Path) -> tuple[Any, set[str]]:
     if isinstance(state, dict) and isinstance(state.get("model"), dict):
         state = state["model"]
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise OptionError(f"{file} is no state dict of a network")
+        raise OptionError(f"{file} is not a state dict of a network")
     model = cls()
     model.load_state_dict(state, strict=False)
     return model, set(state)

@@ -70,7 +70,7 @@ def settings_resumed(
     if settings.discovery not in DISCOVERERS:
         raise OptionError(
             f"this session was begun with --discovery {settings.discovery}, which this version does not have; "
-            "go on with --discovery learned"
+            "continue with --discovery learned"
         )
     if request.chunk is not None or request.overlap is not None:
         settings = replace(settings, chunks=_cut(settings, request.chunk, request.overlap))
@@ -89,7 +89,7 @@ def check_beside(settings: BuildSettings, first: BuildSettings) -> None:
         one, other = vars(first.library), vars(settings.library)
         names = [name for name in one if one[name] != other[name]]
         raise OptionError(
-            f"the memory's library is derived by other settings ({', '.join(names)}); give the same "
+            f"the memory was made with other library settings ({', '.join(names)}); give the same "
             "library settings, or leave the settings out"
         )
 
@@ -139,7 +139,7 @@ def _check_used(asked: Mapping[str, str], selection: ModelSelection) -> None:
     for part, where in asked.items():
         model = getattr(selection, part)
         if not where:
-            raise OptionError(f"--weights {part}= names nothing; give a folder, a file or owner/name@revision")
+            raise OptionError(f"--weights {part}= is empty; give a folder, a file or owner/name@revision")
         if part not in taking and not _reads_files(model):
             raise OptionError(f"--weights {where}: no network does the {part} ({model}); name one with --{part}")
 

@@ -29,23 +29,21 @@ class FinishingError(List3rError):
 def check_run(run: RunOptions) -> None:
     """Raise `OptionError` for what cannot be done, before hours are spent."""
     if run.workers is not None and run.workers < 0:
-        raise OptionError(f"--workers {run.workers}: give how many processes to start, or 0 for none")
+        raise OptionError(f"--workers {run.workers}: give the number of worker processes, 0 for none")
     if run.engine not in ("local", "ray"):
         raise OptionError(f"--engine {run.engine} is not known; choose local or ray")
     if run.engine == "ray" and run.workers == 0:
-        raise OptionError("--workers 0 works in this process alone; leave it out with --engine ray, or give 1 or more")
+        raise OptionError("--workers 0 works in this process only; with --engine ray leave it out or give 1 or more")
     if run.engine != "ray" and run.address is not None:
-        raise OptionError(f"--address {run.address} is of a Ray cluster; give it with --engine ray")
+        raise OptionError(f"--address {run.address} needs --engine ray")
     if run.resume and run.force:
-        raise OptionError("--resume goes on with what is there and --force gives it up; give one of them")
+        raise OptionError("--resume continues what is there and --force discards it; give one of them")
     if run.scale_anchor is not None:
         parse_anchor(run.scale_anchor)
     if run.detector is not None:
         load_detector(run.detector, run.detector_classes)
     elif run.detector_classes is not None:
-        raise OptionError(
-            f"--detector-classes {run.detector_classes} are those of a detector; give it with --detector FILE"
-        )
+        raise OptionError(f"--detector-classes {run.detector_classes} needs a detector: --detector FILE")
 
 
 def finish(

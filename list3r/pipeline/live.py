@@ -127,11 +127,11 @@ def build_live(
     started, run, watch, memory = time.monotonic(), run or RunOptions(), watch or Watch(), Path(memory)
     options, how = options or SourceOptions(), live or LiveSettings()
     if options.more:
-        raise OptionError("a live source is one; several files together are of recordings")
+        raise OptionError("a live source is a single one; only recordings can be several files")
     if run.engine != "local":
-        raise OptionError("a live source is worked on as it comes, by this machine; leave out --engine")
+        raise OptionError("a live source is processed on this machine as it comes; leave out --engine")
     if run.resume:
-        raise OptionError("a live source does not come again; --resume is of files, `update` adds a later session")
+        raise OptionError("a live source cannot be resumed; `list3r update` adds a later session")
     if not run.force and memory.is_file() and memory.stat().st_size:
         raise MemoryFileError(f"{memory} exists already; --force replaces it")
     spool = memory.with_name(f"{memory.name}.frames")
@@ -146,7 +146,7 @@ def build_live(
             _follow(ours, target, how, interrupted, watch)
             store, state = target.store, feed.state()
             if not any(f.state == "posed" for f in store.frames.all()):
-                raise TrackingError(f"the camera could not be followed in any frame of {job.info.path}")
+                raise TrackingError(f"no frame could be posed in {job.info.path}")
             with threadpool_limits(1):
                 finish_session(store, ours.session, job.settings.association, job.settings.carving)
             with store.transaction():
@@ -186,12 +186,12 @@ def _feed(source: str, spool: Path, options: SourceOptions, how: LiveSettings, w
         folder = Path(source).expanduser()
         if not folder.is_dir() and not is_recording(folder):
             raise SourceError(
-                f"{folder} is no folder; --live follows a folder or a bag that grows, or the address of a stream"
+                f"{folder} is not a folder; --live follows a folder or a bag that grows, or the address of a stream"
             )
         yield FolderFeed(folder, options, how)
         return
     if spool.exists():
-        raise OptionError(f"{spool} is left of a stream before; look at what is in it (a folder of images), remove it")
+        raise OptionError(f"{spool} is left from an earlier stream; it is a folder of images: keep or remove it")
     if not spool.parent.is_dir():
         raise MemoryFileError(f"the folder {spool.parent} does not exist; create it first")
     camera = open_camera(source, lambda line: watch.tell((line,)))

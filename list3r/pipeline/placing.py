@@ -29,6 +29,9 @@ from list3r.reconstruction.registry import MODELS
 
 T = TypeVar("T")
 
+_BENT_TOGETHER = 3
+"""Chunks that tell how a new one lies to the one before."""
+
 
 def place_chunks(
     store: Store, settings: AssociationSettings | None = None, new: int | None = None, *, bend: bool = False
@@ -57,6 +60,8 @@ def place_chunks(
         graph = _straightened(store, graph, chunks, metric, how)
     elif new is not None and how.nodes.enabled:
         _look_ahead(store, graph, new, how)
+        if fitted and metric:
+            graph = _as_bent(store, graph, new, how)
     known = {} if store.facts.poses == "given" else graph.covariances
     settled = store.facts.gravity in ("known", "estimated") or len(chunks) % how.up_again
     if fitted and len(chunks) > how.up_always and settled:
@@ -115,6 +120,37 @@ def _look_ahead(store: Store, graph: GraphResult, new: int, how: AssociationSett
         if not poses_given(store, store.chunks.get(new).session_id):
             samples.relations(edge, how.nodes.frames)
             samples.nodes(new, how.nodes.frames)
+
+
+def _as_bent(store: Store, graph: GraphResult, new: int, how: AssociationSettings) -> GraphResult:
+    """The graph with a new chunk that hangs on the one before alone where it will lie when all chunks bend.
+
+    How two neighbours lie to each other then is told by them and the one before to some micrometres; so the end of a
+    long session finds the chunks where they are (decision 0156).
+    """
+    mine = [e for e in graph.edges if new in (e.u, e.v) and e.accepted]
+    if len(mine) != 1 or mine[0].kind != "adjacent" or poses_given(store, store.chunks.get(new).session_id):
+        return graph
+    known = {e.v: e for e in graph.edges if e.kind == "adjacent" and e.accepted and not in_one_frame(e)}
+    chain = [new]
+    while len(chain) < _BENT_TOGETHER and (edge := known.get(chain[0])) is not None:
+        chain.insert(0, edge.u)
+    if len(chain) < 2:
+        return graph
+    start = {chain[0]: Sim3.identity()}  # not where they lie, whose rounding would grow from chunk to chunk
+    for k in chain[1:]:
+        start[k] = start[known[k].u] @ known[k].S_v_u.inverse()
+    part = GraphResult(
+        S_graph_chunk=start,
+        components=dict.fromkeys(chain, chain[0]),
+        edges=tuple(known[k] for k in chain[1:]),
+        residual=1.0,
+        covariances={},
+    )
+    S, here = bend_chunks(SampledChunks.of(store), part, (), True, how.nodes, how.graph)[0].S_graph_chunk, chain[-2]
+    placed = graph.S_graph_chunk[here] @ S[here].inverse() @ S[new]
+    layers = graph.S_graph_chunk.maps if isinstance(graph.S_graph_chunk, ChainMap) else [dict(graph.S_graph_chunk)]
+    return replace(graph, S_graph_chunk=ChainMap({new: placed}, *layers))
 
 
 def _stated_up(store: Store, graph: GraphResult) -> NDArray[np.float64] | None:

@@ -16,7 +16,7 @@ from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.records import SessionCamera
 from list3r.memory.room import BUILD_MB, check_address_space
-from list3r.pipeline.chunks.calibration import estimated_camera, told_camera
+from list3r.pipeline.chunks.calibration import estimated_camera, stated_camera
 from list3r.pipeline.chunks.chunk import ChunkTask, reconstruct
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.pipeline.session import prepare
@@ -77,7 +77,7 @@ def precompute(
     if force or not all(_file(out, span).exists() for span in spans):
         camera = estimated_camera(job.frames(), options, settings, watch.look)
         if camera is not None:
-            options, notes = told_camera(options, camera), [*camera.notes, _said(camera)]
+            options, notes = stated_camera(options, camera), [*camera.notes, _said(camera)]
     opened = open_source(source, options)
     posed: set[int] = set()
     bad: dict[int, str] = {}
@@ -115,7 +115,7 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
     manifest = Manifest("metric" if metric else "relative", named, chunks.length, chunks.overlap)
     make_folder(out)
     if (out / MANIFEST).exists() and not force and read_manifest(out) != manifest:
-        raise OptionError(f"{out} holds files of another model or other chunks; give another --out, or --force")
+        raise OptionError(f"{out} holds files of another model or of other chunks; give another --out, or --force")
     write_manifest(out, manifest)
 
 

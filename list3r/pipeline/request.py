@@ -49,22 +49,22 @@ class BuildRequest:
     preset: str | None = field(
         default=None,
         metadata=option(
-            "cpu: nothing to fetch; light: small networks, free for any use; auto: by what this machine has.",
+            "cpu: nothing to download; light: small networks, free for any use; auto: what this machine can run.",
             "cpu|light|paper|auto",
         ),
     )
     discovery: str | None = field(
         default=None,
-        metadata=option("What finds things; default: learned.", "learned|eomt|mask2former|sam2|sam3|precomputed"),
+        metadata=option("Model that finds things; default: learned.", "learned|eomt|mask2former|sam2|sam3|precomputed"),
     )
     tracking: str | None = field(
         default=None,
-        metadata=option("What follows things from frame to frame.", "reprojection|sam2|sam3|edgetam"),
+        metadata=option("Model that follows things from frame to frame.", "reprojection|sam2|sam3|edgetam"),
     )
     features: str | None = field(
         default=None,
         metadata=option(
-            "What describes the look of a thing; default: by the discovery.", "geometric|own|dinov2|dinov3"
+            "Model that describes the look of a thing; default: by --discovery.", "geometric|own|dinov2|dinov3"
         ),
     )
     device: str = field(default="auto", metadata=option("Where networks run.", "auto|cpu|cuda|cuda:N"))
@@ -72,27 +72,28 @@ class BuildRequest:
         default=(),
         metadata=option(
             "Weights instead of the model's own: a folder, a file or owner/name@revision. PART is reconstruction "
-            "(when left out), discovery, tracking or features.",
+            "(the default), discovery, tracking or features.",
             "[PART=]WHERE",
         ),
     )
     local_features: str = field(
         default="sift",
         metadata=option(
-            "What finds a keyframe again: sift, or aliked=FILE with its weights. With colour alone, aliked also joins "
-            "frames between which nothing can be followed.",
+            "Features by which keyframes are matched: sift, or aliked=FILE with its weights. With colour alone, aliked "
+            "also joins frames that optical flow cannot.",
             "KIND[=FILE]",
         ),
     )
     poses: str = field(
         default="auto",
         metadata=option(
-            "The poses. prior: given, but corrected; auto: given if there are any, prior of phones with depth.",
+            "Camera poses. estimate: from the pictures; given: from the source; prior: given, then corrected; auto: "
+            "prior for phones with depth, given for other sources with poses, else estimate.",
             "auto|estimate|given|prior",
         ),
     )
     chunk: int | None = field(
-        default=None, metadata=option("Frames in a chunk; default: 100, or what the GPU holds of a network.", "N")
+        default=None, metadata=option("Frames in a chunk; default: 100, with a network as many as the GPU holds.", "N")
     )
     overlap: int | None = field(
         default=None, metadata=option("Frames that neighbouring chunks share; default: 30 %.", "N")
@@ -117,21 +118,22 @@ class RunOptions:
     licence: str = field(
         default="research",
         metadata=option(
-            "What weights may be under. permissive: nothing non-commercial, gated, copyleft or of own terms.",
+            "Licences that weights may have. permissive: none that is non-commercial, gated, copyleft or custom.",
             "permissive|research|any",
         ),
     )
     workers: int | None = field(
-        default=None, metadata=option("Processes; 0: none beside this one; default: cores, up to 4.", "N")
+        default=None, metadata=option("Worker processes; 0: work in this process; default: the cores, at most 4.", "N")
     )
     engine: str = field(
         default="local",
         metadata=option(
-            "Where chunks are worked on: local, or ray: on the machines of a cluster, which all see SOURCE at its path."
+            "Where chunks are processed: local, or ray (a cluster whose machines all see SOURCE at the same path)."
         ),
     )
     address: str | None = field(
-        default=None, metadata=option("Of the Ray cluster; default: RAY_ADDRESS, else one started here.", "HOST:PORT")
+        default=None,
+        metadata=option("Address of the Ray cluster; default: RAY_ADDRESS, else a cluster started here.", "HOST:PORT"),
     )
     scale_anchor: str | None = field(
         default=None,
@@ -145,22 +147,23 @@ class RunOptions:
         metadata=option("A NanoDet box detector for ncnn (.param, with its .bin beside it) that names things.", "FILE"),
     )
     detector_classes: Path | None = field(
-        default=None, metadata=option("The detector's classes, one name a line; default: the 80 of COCO.", "FILE")
+        default=None,
+        metadata=option("The detector's classes, one name a line; default: the 80 classes of COCO.", "FILE"),
     )
     live: bool = field(
         default=False,
         metadata=option(
-            "build: SOURCE is a folder or recording that still grows. Webcams and streams are live anyway."
+            "build: SOURCE is a folder or recording that still grows. Webcams and streams are always live."
         ),
     )
-    resume: bool = field(default=False, metadata=option("Go on with what was interrupted."))
+    resume: bool = field(default=False, metadata=option("Continue a build or update that was interrupted."))
     force: bool = field(
         default=False,
         metadata=option("build: replace an existing memory. update: give up an update that was interrupted."),
     )
 
 
-class RunWords(TypedDict, total=False):
+class RunArguments(TypedDict, total=False):
     """The fields of `RunOptions` as arguments of Python."""
 
     licence: str

@@ -15,7 +15,7 @@ from list3r.frames.base import FrameSource, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.chunking.pace import depth_step
-from list3r.frames.pose_agreement import scale_doubts, wrong_convention
+from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
 from list3r.memory.errors import OptionError, SourceError
@@ -141,8 +141,7 @@ def prepare(
     chosen = resolve_settings(chosen, info)
     check_buildable(info, chosen)
     if chosen.poses != "estimate":
-        check_convention(opened)
-        notes += scale_doubts(opened)
+        check_agreement(opened)
     return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes), opened)
 
 
@@ -342,7 +341,7 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"--poses {settings.poses} is not known; choose estimate, prior, given or auto")
     model, every = entry(settings.reconstruction), settings.depth_every
     if every is not None and not 1 <= every <= MOST_DEPTH_EVERY:
-        raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; --every takes fewer frames at all")
+        raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; to take fewer frames use --every")
     if every is not None and every > 1 and not model.thins:
         raise OptionError(
             f"--depth-every is of models that compute depth from colour (sfm), not of {settings.reconstruction}; leave "
@@ -382,17 +381,13 @@ def _check_prior(info: SourceInfo, reconstruction: str) -> None:
             f"{otherwise}"
         )
     if not entry(reconstruction).follows_prior:
-        raise OptionError(f"--poses prior is of --reconstruction rgbd, not of {reconstruction}; {otherwise}")
+        raise OptionError(f"--poses prior needs --reconstruction rgbd, not {reconstruction}; {otherwise}")
 
 
-def check_convention(source: FrameSource) -> None:
-    """Raise `SourceError` where given poses fit the depth only in another convention than they are read in."""
-    found = wrong_convention(source)
-    if found is not None:
-        raise SourceError(
-            f"the poses of {source.info.path} do not fit its depth as they are read, but would {found}: whoever wrote "
-            "them meant another convention; write them anew, or use --poses estimate"
-        )
+def check_agreement(source: FrameSource) -> None:
+    """Raise `SourceError` where given poses contradict what the frames show."""
+    for found in disagreements(source):
+        raise SourceError(f"{source.info.path}: {found}; mend that, or use --poses estimate, which does without poses")
 
 
 def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:

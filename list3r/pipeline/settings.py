@@ -124,10 +124,6 @@ class BuildSettings:
         return [f.name for f in fields(self) if getattr(self, f.name) != getattr(other, f.name)]
 
 
-CHOICES = ("reconstruction", "poses", "device", "weights", "discovery", "tracking", "features", "instance_weights")
-"""Fields that name models: what suits one source may not suit the next."""
-
-
 def session_settings(session: Session) -> BuildSettings:
     """Return the settings that a session was made with; what an older version did not store has its default.
 

@@ -82,7 +82,7 @@ def _replacing(path: Path, aside: Path) -> Target:
     with Store.open(path) as store:
         begun, ours = _holds_something(store), _is_marked(store, aside)
     if os.path.lexists(aside) and not ours:
-        raise MemoryFileError(f"{aside} has the name under which --force keeps {path.name}; move it away")
+        raise MemoryFileError(f"{aside} is where --force would keep {path.name}; move it away")
     Store.open(path, writable=True).close()
     if ours and not begun:
         remove_memory(path)
@@ -139,13 +139,13 @@ def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None
         if session.fingerprint != info.fingerprint:
             raise OptionError(
                 f"{store.path} was begun from {session.source} with other frames or camera options; "
-                "give the same source and options to --resume, or --force to begin anew"
+                "give the same source and options to --resume, or --force to start again"
             )
         different = session_settings(session).differing(settings)
         if different:
             raise OptionError(
                 f"{store.path} was begun with other settings ({', '.join(different)}); "
-                "give the same ones to --resume, or --force to begin anew"
+                "give the same ones to --resume, or --force to start again"
             )
 
 
@@ -154,4 +154,4 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OptionError(f"the folder {path} cannot be made: {error.strerror}; name another one") from error
+        raise OptionError(f"the folder {path} cannot be created: {error.strerror}; name another one") from error

@@ -73,20 +73,20 @@ class Filters:
     """Which instances a question is about."""
 
     structure: bool = False
-    """Whether floor, walls and the like may answer."""
+    """Whether floor, walls and the like are included."""
     min_confidence: float = 0.0
     state: str | None = None
-    """present, moved, removed, added, unseen, or any; None for all that are not known to be gone."""
+    """present, moved, removed, added, unseen, or any; None for all but removed."""
     label: str | None = None
-    """Words that the label or the description must all bear."""
+    """Words that must all be in the label, the description or the kind of structure."""
     color: str | None = None
-    """A colour: "red" also takes what is dark red."""
+    """A colour; "red" includes dark red."""
     min_size: float | None = None
     """Longest edge at least this, world units."""
     max_size: float | None = None
     """Longest edge at most this, world units."""
     component: int | None = None
-    """Only this part of a memory whose parts are not joined, see `Instance.component`."""
+    """Only this connected component, see `Instance.component`."""
     dynamic: bool | None = None
     """Only what was seen moving (True), or what was not (False)."""
 

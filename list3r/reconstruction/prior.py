@@ -30,6 +30,10 @@ class PriorSettings:
     """What a pose moves against what depth shows from one frame to the next is a jump beyond this,"""
     jump_deg: float = 1.5
     """or beyond this turn."""
+    jump_inliers: float = 0.9
+    """A frame that contradicts its step by so much is believed with this share of the usual inliers,"""
+    jump_correlation: float = 0.8
+    """and this correlation of brightness: true jumps have 0.98, blurred pictures of a bare floor 0.5 to 0.7."""
 
 
 def given_step(before: Poses | None, after: Poses | None) -> Poses | None:

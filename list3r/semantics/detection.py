@@ -19,7 +19,7 @@ from list3r.memory.masks import decode_mask
 from list3r.memory.records import ChunkRow, MaskTrack, Votes
 from list3r.memory.store.store import Store
 from list3r.semantics.detector import Detector
-from list3r.semantics.voting import Seen, VotingSettings, summed, vote
+from list3r.semantics.voting import ThingInFrame, VotingSettings, summed, vote
 
 LOOKS_PER_S = 5.0
 """Frames of a source looked at in a second: nearer ones show the same view and are told the same."""
@@ -177,7 +177,7 @@ def _fitting(color: NDArray[np.uint8], chunk: ChunkRow) -> NDArray[np.uint8]:
 
 def _seen(
     index: int, tracks: Mapping[int, MaskTrack], home: Mapping[int, int], sizes: Mapping[int, NDArray[np.float64]]
-) -> list[Seen]:
+) -> list[ThingInFrame]:
     """The things that one frame shows; pieces of one thing together."""
     parts: dict[int, list[tuple[int, int]]] = {}
     for local_id, track in tracks.items():
@@ -193,7 +193,7 @@ def _seen(
         box = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
         visible = float((areas * [t.visible_fraction[at] for t, at in chosen]).sum() / areas.sum())
         shares = tuple((areas / areas.sum()).tolist())
-        out.append(Seen(tuple(n for n, _ in pieces), shares, box, mask, visible, sizes.get(instance_id)))
+        out.append(ThingInFrame(tuple(n for n, _ in pieces), shares, box, mask, visible, sizes.get(instance_id)))
     return out
 
 

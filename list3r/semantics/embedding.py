@@ -91,7 +91,7 @@ def embed_memory(
     return EmbedReport(network.space, len(ids), everything - len(ids))
 
 
-class StoredWords:
+class StoredTextModel:
     """The text side of the model that a memory was embedded with, loaded when the first word is compared."""
 
     def __init__(self, space: str, weights: str, device: str = "auto") -> None:
@@ -130,12 +130,12 @@ class StoredWords:
         return self._model
 
 
-def stored_words(store: Store, device: str = "auto") -> StoredWords | None:
+def stored_text_model(store: Store, device: str = "auto") -> StoredTextModel | None:
     """What compares free words with the things of a memory, None where `list3r embed` was not run on it."""
     spaces = store.embeddings.spaces()
     for space, weights in sorted(dict(store.facts.text_models).items()):
         if space in spaces:
-            return StoredWords(space, str(weights), device)
+            return StoredTextModel(space, str(weights), device)
     return None
 
 

@@ -132,7 +132,7 @@ def read_class_names(path: Path) -> tuple[str, ...]:
     except OSError as error:
         raise OptionError(f"--detector-classes {path} cannot be read ({error.strerror or error})") from None
     except UnicodeDecodeError:
-        raise OptionError(f"--detector-classes {path} is no text; one name a line is needed") from None
+        raise OptionError(f"--detector-classes {path} is not a text file; it must hold one name per line") from None
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
         raise OptionError(f"--detector-classes {path} is empty; one name a line is needed")
@@ -178,7 +178,7 @@ def _strides(param: Path) -> list[int]:
         raise OptionError(f"--detector {param}: a .param file of ncnn is needed, with its .bin beside it") from None
     found = sorted({int(m[1]) for word in text.split() if (m := _GRID.match(word))})
     if not text.startswith("7767517") or not found:
-        raise OptionError(f"--detector {param} is no NanoDet for ncnn (it has no outputs cls_pred_stride_8, ...)")
+        raise OptionError(f"--detector {param} is not a NanoDet for ncnn (it has no outputs cls_pred_stride_8, ...)")
     return found
 
 

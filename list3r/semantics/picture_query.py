@@ -12,7 +12,7 @@ from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.files import read_file
 from list3r.memory.errors import FrameError, OptionError, SourceError
 from list3r.memory.store.store import Store
-from list3r.semantics.embedding import stored_words
+from list3r.semantics.embedding import stored_text_model
 
 Box = tuple[float, float, float, float]
 
@@ -40,7 +40,7 @@ def picture_query(store: Store, image: str | Path | NDArray[np.uint8], box: Box 
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
         raise OptionError(f"a picture must have the shape (height, width, 3), not {picture.shape}")
     chosen = _checked_box(box, picture.shape[1], picture.shape[0])
-    words = stored_words(store)
+    words = stored_text_model(store)
     if words is not None:
         from list3r.semantics.text_image import square_crop
 

@@ -51,7 +51,7 @@ class VotingSettings:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ThingInFrame:
     """A thing in one frame, by its local instances."""
 
     locals: tuple[int, ...]
@@ -71,7 +71,7 @@ class Seen:
 def vote(
     detections: Detections,
     names: Sequence[str],
-    things: Sequence[Seen],
+    things: Sequence[ThingInFrame],
     gap_s: float = np.inf,
     settings: VotingSettings | None = None,
     region_xyxy: NDArray[np.float32] | None = None,
@@ -115,7 +115,7 @@ def summed(votes: Iterable[Mapping[int, Votes]]) -> dict[int, Votes]:
     return dict(sorted(out.items()))
 
 
-def _weight(thing: Seen, s: VotingSettings) -> float:
+def _weight(thing: ThingInFrame, s: VotingSettings) -> float:
     """How much the frame can say of the thing: 0 where it is too small or hidden."""
     height, width = thing.mask.shape
     x0, y0, x1, y1 = (float(v) for v in thing.box_xyxy)
@@ -127,11 +127,11 @@ def _weight(thing: Seen, s: VotingSettings) -> float:
     return thing.visible * (0.5 if cut else 1.0)
 
 
-def _can_be(name: str, thing: Seen) -> bool:
+def _can_be(name: str, thing: ThingInFrame) -> bool:
     return thing.size_m is None or plausible(name, thing.size_m)
 
 
-def _fit(box: NDArray[np.float32], thing: Seen, s: VotingSettings) -> float:
+def _fit(box: NDArray[np.float32], thing: ThingInFrame, s: VotingSettings) -> float:
     """How well a box and a thing fit, in [0, 1]; 0 for not at all."""
     a, b = box.astype(np.float64), thing.box_xyxy.astype(np.float64)
     low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])

@@ -43,7 +43,7 @@ _OF_MANY = (
 
 @dataclass(frozen=True)
 class HttpSettings:
-    """How the server is reached over HTTP; only from this machine."""
+    """How the server is reached over HTTP, only from this machine."""
 
     port: int = 8740
     """0: any free one."""
@@ -153,7 +153,7 @@ def _public_methods(tools: object) -> Iterator[Callable[..., Any]]:
 
 
 def _told(tool: Callable[..., Any]) -> Callable[..., Any]:
-    """The same tool; what the user can mend is told to the agent in one line."""
+    """Return the same tool; errors that the user can mend reach the agent as one line."""
 
     @functools.wraps(tool)
     def asked(*args: Any, **words: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The tools that ask a catalogue of many memories: the questions of its face, for agents."""
+"""The tools that ask a catalogue of many memories, for agents."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CatalogTools:
         self._catalog = catalog
 
     def memories(self, limit: Limit = 50, offset: Offset = 0) -> dict[str, Any]:
-        """The memories that are there: name, file, revision, how many things and sessions. Start here."""
+        """The memories of the catalogue: name, file, revision, number of things and sessions. Start here."""
         return page([asdict(e) for e in self._catalog.memories()], "", limit, offset)
 
     def find(self, text: Words, memory: InMemory = None, limit: Limit = 10) -> dict[str, Any]:
@@ -53,7 +53,7 @@ class CatalogTools:
         return _told(found, limit)
 
     def similar(self, memory: Memory, id: Id, everywhere: bool = True, limit: Limit = 10) -> dict[str, Any]:
-        """The things that look like one of a memory: over all memories, or in that one alone."""
+        """The things that look like a given instance, in all memories or in its own."""
         return _told(self._catalog.similar(memory, instance_id=id, anywhere=everywhere, k=limit))
 
     def relations(
@@ -64,7 +64,7 @@ class CatalogTools:
         object: End = None,
         limit: Limit = 20,
     ) -> dict[str, Any]:
-        """Stored relations (on, in, next_to, near, ...) in one memory or over all, by words or ids of their ends."""
+        """Stored relations (on, in, next_to, near, ...) in one memory or over all, by words or ids."""
         return _told(self._catalog.relations(memory, subject=subject, predicate=predicate, object=object, k=limit))
 
 

@@ -27,7 +27,7 @@ from list3r.server.records import (
     relation_record,
 )
 
-Id = Annotated[int, Field(description="Id of an instance; ids that were merged away stand for what they are now.")]
+Id = Annotated[int, Field(description="Id of an instance. An id that was merged resolves to the present instance.")]
 Point = Annotated[list[float], Field(description="x, y, z in world units.", min_length=3, max_length=3)]
 Limit = Annotated[int, Field(description="Entries of a page.", ge=1, le=MOST)]
 Offset = Annotated[int, Field(description="Entries to skip, for further pages.", ge=0)]
@@ -40,13 +40,13 @@ _TRACK_POINTS = 60
 
 
 class ReadingTools:
-    """Questions to one memory; each public method is a tool."""
+    """Questions about one memory; each public method is a tool."""
 
     def __init__(self, memory: SceneMemory) -> None:
         self._memory = memory
 
     def overview(self) -> dict[str, Any]:
-        """What the memory holds: units, what is up, how many things of which names, extent, sessions. Start here."""
+        """Summary of the memory: units, up direction, number of things by name, extent, sessions. Start here."""
         m = self._memory
         everything = m.instances(structure=None)
         things = [i for i in everything if i.structure is None and i.state != "removed"]
@@ -71,7 +71,7 @@ class ReadingTools:
     def find(self, text: Words, limit: Limit = 10) -> dict[str, Any]:
         """The things that a phrase describes, the best first, such as "white mug on the table" or "the biggest chair".
 
-        An empty answer means that nothing fits; `notes` say which words nothing bears.
+        An empty answer means that nothing fits; `notes` name the words that describe nothing.
         """
         found = self._memory.find(text, limit)
         told = {"total": found.total, "ambiguous": found.ambiguous, "unknown_words": list(found.unknown_words)}
@@ -87,8 +87,8 @@ class ReadingTools:
         label: str | None = None,
         color: str | None = None,
     ) -> dict[str, Any]:
-        """The things nearest to an instance or to a point, by the gap between surfaces; only those of a label or colour
-        where asked. With `words` the things that they name best.
+        """The things nearest to an instance or to a point, by the gap between surfaces; optionally only those with a
+        label or colour. With `words` instead: the things that they name best.
         """
         given = [x for x in (id, point, words) if x is not None]
         if len(given) != 1:
@@ -119,8 +119,8 @@ class ReadingTools:
         offset: Offset = 0,
     ) -> dict[str, Any]:
         """Relations that match what is given: on, supports, in, contains, above, below, under, next_to, near,
-        attached_to; left_of, right_of, in_front_of and behind with a viewpoint. `state` is unknown where the memory
-        cannot tell.
+        attached_to; left_of, right_of, in_front_of and behind with a viewpoint. `state` is unknown if the memory
+        cannot decide.
         """
         found = self._memory.relations(subject, predicate, object, viewpoint=viewpoint)
         return self._relations(found, limit, offset)
@@ -147,7 +147,7 @@ class ReadingTools:
         }
 
     def describe(self, id: Id) -> dict[str, Any]:
-        """All that is known of one instance: what, where, how large and turned, when seen, how sure, its relations."""
+        """All that is known of one instance: name, place, size, rotation, times, confidence, relations."""
         m = self._memory
         i = m.instance(id)
         names = self._names()
@@ -193,12 +193,12 @@ class ReadingTools:
         limit: Limit = 20,
         offset: Offset = 0,
     ) -> dict[str, Any]:
-        """What later sessions showed to be moved, removed and added, the newest first."""
+        """The things that later sessions moved, removed or added, the newest first."""
         found = self._memory.changes(since)
         return page([change_record(c) for c in found], self._memory.units, limit, offset)
 
     def path_of(self, id: Id) -> dict[str, Any]:
-        """Where an instance has been: its track while it moved, its moves between sessions, when it was seen."""
+        """Where an instance was: its track while it moved, its moves between sessions, and when it was seen."""
         m = self._memory
         i = m.instance(id)
         times, places = m.track(i.id)

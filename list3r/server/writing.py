@@ -19,21 +19,21 @@ class WritingTools:
         self._memory = memory
 
     def label(self, id: Id, text: Annotated[str | None, Field(max_length=200)]) -> dict[str, Any]:
-        """Name an instance; null takes the name away."""
+        """Name an instance; null removes the name."""
         return self._memory.label(id, text, author=_AUTHOR).as_dict()
 
     def merge(self, a: Id, b: Id) -> dict[str, Any]:
-        """Two instances are one thing; the older id stays."""
+        """Merge two instances that are one thing; the older id stays."""
         return self._memory.merge(a, b, author=_AUTHOR).as_dict()
 
     def split(self, id: Id) -> dict[str, Any]:
-        """An instance is two things: what the evidence parts from it best leaves it."""
+        """Split an instance that is two things, where the evidence separates them best."""
         return self._memory.split(id, author=_AUTHOR).as_dict()
 
     def delete(self, id: Id) -> dict[str, Any]:
-        """Take an instance out of the memory."""
+        """Remove an instance from the memory."""
         return self._memory.delete(id, author=_AUTHOR).as_dict()
 
     def undo(self, entry: int | None = None) -> dict[str, Any]:
-        """Take back an edit by the entry that it returned; without one, the last edit that stands."""
+        """Undo an edit by the entry that it returned; by default the last edit that is not undone."""
         return self._memory.undo(entry, author=_AUTHOR).as_dict()

@@ -72,13 +72,6 @@ def look_poses(position: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
     return poses
 
 
-def looking_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> Array:
-    """T_world_cam of an upright camera at `eye` that looks at `target`, metres. Shape (4, 4)."""
-    x, y, z = np.array(target) - np.array(eye)
-    angles = [np.array([a]) for a in (np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), 0.0)]
-    return np.asarray(look_poses(np.array([eye]), *angles)[0])
-
-
 def _path(stops: tuple[Stop, ...], settings: PathSettings) -> tuple[Array, Array, Array, Array]:
     """Dense clock (s), eye (m), yaw and pitch (rad) of a round that keeps the limits everywhere."""
     eye = np.array([s.eye for s in stops])

@@ -16,12 +16,12 @@ from list3r.api import SceneMemory
 from list3r.api import open as open_scene
 from list3r.memory.errors import List3rError
 from list3r.viewer.clouds import CloudSettings, PageClouds, Shown
+from list3r.viewer.instance_text import described
 from list3r.viewer.layers import Layers, LayerSettings
 from list3r.viewer.link import ViewState
 from list3r.viewer.names import NameSettings, PageNames
 from list3r.viewer.panel import Panel
 from list3r.viewer.serving import HOST, quiet, start_server
-from list3r.viewer.told import described
 from list3r.viewer.world import ShownCloud, ShownWorld, overview, pick, read_path, read_world
 
 _PICTURE_PX = 200

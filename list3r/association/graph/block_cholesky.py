@@ -60,8 +60,6 @@ class BlockPattern:
     fronts: tuple[Front, ...]
     flipped: NDArray[np.bool_]
     """True where an off-diagonal block is used transposed. Shape (N,)."""
-    front_of: Rows
-    """Front that eliminates each block. Shape (n,)."""
 
     @staticmethod
     def analyse(count: int, rows: Rows, columns: Rows, size: int) -> BlockPattern:
@@ -143,9 +141,7 @@ def _pattern(count: int, size: int, place: Rows, structure: list[Rows], rows: Ro
         scalar = (into[:, None] * size + np.arange(size)).ravel()
         repeated = len(np.unique(at[0] * count + at[1])) < len(entries)
         fronts.append(Front(block_at[a:b], block_at[below[k]], parent, scalar, entries, at, repeated))
-    front_of = np.empty(count, np.int64)
-    front_of[block_at] = front_at
-    return BlockPattern(count, size, tuple(fronts), place[rows] < place[columns], front_of)
+    return BlockPattern(count, size, tuple(fronts), place[rows] < place[columns])
 
 
 def _below(structure: list[Rows], first: int, end: int) -> Rows:

@@ -96,7 +96,7 @@ def _accepted_of(chunk: int, edges: Sequence[Edge]) -> list[int]:
 def _moved(
     new: int, here: int, edges: Sequence[Edge], started: GraphResult, metric: bool, settings: GraphSettings
 ) -> tuple[dict[int, Sim3], list[Edge]]:
-    """Move the neighbourhood by a step and judge the new chunk's loops; other edges are believed as before.
+    """Move the neighbourhood by a step and solve_with_trust the new chunk's loops; other edges are believed as before.
 
     `started` holds the new chunk too, where its edge to `here` puts it. Returns the poses that moved, and all edges.
     """

@@ -61,7 +61,7 @@ class TrustSettings:
 
 
 @dataclass(frozen=True)
-class Believed:
+class TrustedGraph:
     """A graph with its edges judged."""
 
     poses: Sim3
@@ -90,9 +90,9 @@ class Tree:
     """Rows, parents first. Shape (K,)."""
 
 
-def judge(
+def solve_with_trust(
     problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], robust: bool, settings: TrustSettings
-) -> Believed:
+) -> TrustedGraph:
     """Solve the graph and find which edges to believe. `loop` (E,) marks those that may be false."""
     kinds = loop.astype(np.int64)
     limit = _limits(problem, loop, settings)
@@ -109,7 +109,7 @@ def judge(
             break
     scaled = problem.scaled(factors[kinds])
     known = marginals(scaled, poses, np.maximum(trust, NO_TRUST))
-    return Believed(poses, trust, scaled.squares(poses), limit, factors, freedom, known)
+    return TrustedGraph(poses, trust, scaled.squares(poses), limit, factors, freedom, known)
 
 
 def _limits(problem: GraphProblem, loop: NDArray[np.bool_], settings: TrustSettings) -> Array:

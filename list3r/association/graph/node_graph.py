@@ -22,7 +22,6 @@ from list3r.association.graph.chunk_nodes import (
     NodeSettings,
     Tie,
     measured_walk,
-    ties_of,
     walk_covariance,
 )
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of
@@ -48,6 +47,8 @@ class NodeGraphParts:
     """By chunk id."""
     relations: list[tuple[Edge, FrameRelations]]
     """Of adjacent edges that are believed."""
+    chunks: SampledChunks
+    """Where it comes from."""
 
     @cached_property
     def first(self) -> dict[int, int]:
@@ -97,7 +98,7 @@ def pieces_of(
         nodes[chunk] = chunks.nodes(chunk, length[chunk])
         if (edge := to.get(chunk)) is not None:
             relations.append((edge, chunks.relations(edge, length[edge.u])))
-    return NodeGraphParts(nodes, relations)
+    return NodeGraphParts(nodes, relations, chunks)
 
 
 def _problem(
@@ -127,7 +128,7 @@ def _problem(
     tied = set()
     for edge, relations in pieces.relations:
         relations = relations.rigid() if metric else relations
-        ties = ties_of(relations, edge, pieces.nodes[edge.u], pieces.nodes[edge.v], settings)
+        ties = pieces.chunks.ties(edge, relations, (pieces.nodes[edge.u], pieces.nodes[edge.v]), settings)
         for tie in ties:
             add(first[edge.u] + tie.u, first[edge.v] + tie.v, tie.S_v_u, tie.covariance)
         if ties:

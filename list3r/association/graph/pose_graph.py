@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.association.graph.edge_information import WeightSettings, information, own_shapes, plain_information
-from list3r.association.graph.loop_trust import Believed, Tree, TrustSettings, judge
+from list3r.association.graph.loop_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
 from list3r.association.graph.marginals import widening
 from list3r.association.graph.solver import GraphProblem, adjoint, stack, take, unstack
 from list3r.memory.errors import DegenerateError
@@ -99,7 +99,7 @@ def optimize(
     row = {chunk: k for k, chunk in enumerate(ids)}
     problem = problem_of(active, row, np.array([component[chunk] == chunk for chunk in ids]), weights)
     loop = np.array([e.kind != "adjacent" for e in active])
-    found = judge(problem, stack([start[k] for k in ids]), tree, loop, chosen.robust, chosen.trust)
+    found = solve_with_trust(problem, stack([start[k] for k in ids]), tree, loop, chosen.robust, chosen.trust)
     strength = _strengths(problem.information / found.factors[loop.astype(np.int64), None, None])
     for n, k in enumerate(used):
         out[k] = _judged(edges[k], float(strength[n]), float(found.squares[n]), found, n)
@@ -137,10 +137,10 @@ def check(edges: Sequence[Edge]) -> None:
         finite[stated] &= np.isfinite(np.array([edges[k].covariance for k in stated])).all(axis=(1, 2))
     if not finite.all():
         e = edges[int(np.argmin(finite))]
-        raise DegenerateError(f"the edge between chunks {e.u} and {e.v} ({e.kind}) holds a number not finite")
+        raise DegenerateError(f"the edge between chunks {e.u} and {e.v} ({e.kind}) has a value that is not finite")
 
 
-def _covariances(found: Believed, own: Array, first: NDArray[np.int64]) -> Array:
+def _covariances(found: TrustedGraph, own: Array, first: NDArray[np.int64]) -> Array:
     """Return the covariance stated of each chunk: its place in the graph, its own bending, and that of the first chunk,
     `first` (K,), which moves all others. Shape (K, 7, 7)."""
     size = found.marginals.covariance.shape[1]
@@ -261,7 +261,7 @@ def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
     return out
 
 
-def _judged(edge: Edge, strength: float, square: float, found: Believed, n: int) -> Edge:
+def _judged(edge: Edge, strength: float, square: float, found: TrustedGraph, n: int) -> Edge:
     """Return the edge with its weight in the graph, and what the graph thinks of it."""
     deviations = deviations_of(square)
     trusted = bool(found.trust[n] > 0.5)

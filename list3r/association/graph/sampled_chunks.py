@@ -8,7 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.association.graph.chunk_nodes import ChunkNodes, FrameRelations, relate_frames
+from list3r.association.graph.chunk_nodes import (
+    ChunkNodes,
+    FrameRelations,
+    NodeSettings,
+    Tie,
+    relate_frames,
+    ties_of,
+)
 from list3r.memory.records import Edge, FrameSamples
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
@@ -31,6 +38,13 @@ class _Relations(LruCache[Hashable, FrameRelations]):
         super().__init__(_KEPT_BYTES, _bytes_of)
 
 
+class _Ties(LruCache[Hashable, tuple[Tie, ...]]):
+    """By the edge, checksums of what its chunks measured, their nodes, what the frames say, and settings."""
+
+    def __init__(self) -> None:
+        super().__init__(_KEPT_BYTES, lambda ties: 200 + 1000 * len(ties))
+
+
 class _Samples(LruCache[Hashable, FrameSamples]):
     """Of the two chunks that were asked for last."""
 
@@ -46,6 +60,7 @@ class SampledChunks:
         self._read, self._store = read, store
         derived = Derived() if store is None else store.derived
         self._nodes, self._relations, self._held = derived.of(_Nodes), derived.of(_Relations), derived.of(_Samples)
+        self._ties = derived.of(_Ties)
 
     @staticmethod
     def of(store: Store) -> SampledChunks:
@@ -69,6 +84,17 @@ class SampledChunks:
             nodes = self.nodes(edge.u, length)
             found = relate_frames(self._samples(edge.u), self._samples(edge.v), edge, nodes)
         return self._relations.put(key, found)
+
+    def ties(
+        self, edge: Edge, relations: FrameRelations, nodes: tuple[ChunkNodes, ChunkNodes], settings: NodeSettings
+    ) -> tuple[Tie, ...]:
+        """Return the relations of an edge averaged over the frames of each of the nodes of its chunks."""
+        key = (
+            (edge.u, edge.v, self._stamp(edge.u), self._stamp(edge.v), edge.S_v_u.as_matrix().tobytes()),
+            (*(len(n.at) for n in nodes), bool(relations.off[:, 6].any()), settings),
+        )
+        found = self._ties.get(key)
+        return found if found is not None else self._ties.put(key, tuple(ties_of(relations, edge, *nodes, settings)))
 
     def _stamp(self, chunk: int) -> int:
         return 0 if self._store is None else self._store.chunks.checksum(chunk)

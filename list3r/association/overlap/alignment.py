@@ -202,9 +202,9 @@ def _usable(every: _Pairs, settings: AlignmentSettings) -> tuple[_Pairs, NDArray
     for side in (pairs.u, pairs.v):
         spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(side.T, aweights=pairs.weight)), 0.0))
         if not spread[2] > 1e-9 * np.abs(side).max():
-            raise DegenerateError("the points have no extent: neither rotation nor scale can be told")
+            raise DegenerateError("the points have no extent: rotation and scale are undetermined")
         if spread[1] < settings.least_width * spread[2]:
-            raise DegenerateError("the points lie on one line and leave the rotation about it open")
+            raise DegenerateError("the points lie on one line, so the rotation about it is undetermined")
     return pairs, used
 
 
@@ -305,17 +305,17 @@ def _check_extent(p: Array, q: Array, weight: Array, settings: AlignmentSettings
     _, across, along = np.linalg.eigvalsh((together + together.T) / 2.0)
     noise = float(w @ ((dp - dq) ** 2).sum(axis=1)) / 3.0
     if across < min(settings.line_noise * noise, settings.line_share * along):
-        raise DegenerateError("beside their noise the points lie on one line and leave the rotation about it open")
+        raise DegenerateError("within their noise the points lie on one line, so the rotation about it is undetermined")
 
 
 def _check_determined(covariance: Array, metric: bool, settings: AlignmentSettings) -> None:
     angle = float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[2], 0.0)))
     if not angle < settings.most_angle_sigma_rad:
         raise DegenerateError(
-            f"the points leave the rotation open (to {angle:.2g} rad): beside their noise they lie on a line or a spot"
+            f"the rotation is undetermined (to {angle:.2g} rad): within their noise the points lie on a line or a spot"
         )
     scale = float(np.sqrt(max(covariance[6, 6], 0.0)))
     if not metric and not scale < settings.most_scale_sigma:
         raise DegenerateError(
-            f"the points leave the scale open (to {scale:.0%}): they have no extent beside their noise"
+            f"the scale is undetermined (to {scale:.0%}): the points have no extent beyond their noise"
         )

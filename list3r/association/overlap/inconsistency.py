@@ -43,8 +43,6 @@ class Inconsistency:
 
     delta_px: Floats
     """The paper's delta. Shape (R,)."""
-    along: Floats
-    """Displacement along the ray relative to the frame, as a share of the depth. Shape (R,)."""
     excess: Floats
     """How many times what a static region is off by at most; 0 where there are too few pairs to judge. Shape (R,)."""
 
@@ -91,7 +89,7 @@ def inconsistency(
         np.bincount(regions.of_pair, sure, len(regions.count)), 1
     )
     excess = np.where(judged, np.maximum(across / limit_across, along / limit_along), 0.0)
-    return Inconsistency(mean_delta, along, excess)
+    return Inconsistency(mean_delta, excess)
 
 
 def relative_to_frame(pairs: Pairs, S_v_u: Sim3, rest: Mask) -> Floats:

@@ -83,11 +83,6 @@ class Ways:
         return _along(near, u, v, self._settings)
 
 
-def predict(edges: Iterable[Edge], u: int, v: int, settings: ChainSettings) -> Prediction | None:
-    """Return the relation of two chunks along the surest path of accepted edges; None where there is no path."""
-    return Ways(edges, settings).predict(u, v)
-
-
 def _order(edge: Edge) -> tuple[int, int, str, tuple[int, int]]:
     return edge.u, edge.v, edge.kind, edge.frames or (0, 0)
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.association.whole_map.video_map import VideoMap, map_video
 from list3r.frames.base import Frame, FrameSource
 from list3r.frames.chunking.pace import PaceSettings, picture_flows
+from list3r.frames.decoding.picture import gray_of
 from list3r.reconstruction.sfm.settings import SfmSettings
 
 
@@ -30,7 +29,7 @@ def map_source(source: FrameSource, sfm: SfmSettings, settings: VideoMapSettings
     """
     camera = source.info.camera
     assert camera is not None, "the camera is estimated before"
-    frames = [(f.index, _gray(f)) for f in source.read(0, source.info.frame_count) if isinstance(f, Frame)]
+    frames = [(f.index, gray_of(f)) for f in source.read(0, source.info.frame_count) if isinstance(f, Frame)]
     found = map_video([gray for _, gray in frames], camera, sfm, settings)
     if found is None:
         return None
@@ -40,7 +39,3 @@ def map_source(source: FrameSource, sfm: SfmSettings, settings: VideoMapSettings
         T_map_cam={index[k]: T for k, T in found.T_map_cam.items()},
         revisits=[(index[a], index[b], count) for a, b, count in found.revisits],
     )
-
-
-def _gray(frame: Frame) -> NDArray[np.uint8]:
-    return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)

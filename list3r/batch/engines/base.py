@@ -21,7 +21,7 @@ class TaskResources:
 
     def __post_init__(self) -> None:
         if self.cpus < 1:
-            raise OptionError(f"--cpus {self.cpus}: a task takes at least 1")
+            raise OptionError(f"--cpus {self.cpus}: give 1 or more")
         if self.memory_gb is not None and not self.memory_gb > 0:
             raise OptionError(f"--task-memory {self.memory_gb}: give GiB above 0")
         if not self.gpus >= 0:
@@ -56,9 +56,9 @@ def make_engine(name: str, resources: TaskResources, jobs: int | None, address: 
     if name not in known:
         raise OptionError(f"--engine {name} is not known; choose one of: {', '.join(known)}")
     if address is not None and name != "ray":
-        raise OptionError(f"--address {address} is of a Ray cluster; give it with --engine ray")
+        raise OptionError(f"--address {address} needs --engine ray")
     if jobs is not None and jobs < 1:
-        raise OptionError(f"--jobs {jobs}: at least 1 task must run")
+        raise OptionError(f"--jobs {jobs}: give 1 or more")
     return known[name]()
 
 

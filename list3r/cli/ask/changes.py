@@ -15,11 +15,13 @@ def changes(
     since: Annotated[
         int | None, typer.Option("--since", metavar="SESSION", help="Only what changed after this session.")
     ] = None,
-    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also what was found where it was.")] = False,
-    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only changes at least this sure.")] = 0.0,
+    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also things that were found unchanged.")] = False,
+    min_confidence: Annotated[
+        float, typer.Option("--min-confidence", help="Only changes with at least this confidence.")
+    ] = 0.0,
     json: JsonOption = False,
 ) -> None:
-    """The things that were moved, removed and added from one session to the next, with the frames that show it.
+    """The things that were moved, removed or added between sessions, with frames that show it.
 
     Example: list3r query changes house.l3r --since 1
     """

@@ -17,24 +17,18 @@ if TYPE_CHECKING:
     from list3r.memory.records import DetectedLabel, Instance, Relation
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("info")(info)
-    app.command("list")(list_instances)
-    app.command("show")(show)
-
-
 def info(
     memory: MemoryArgument,
     loops: Annotated[
         bool,
         typer.Option(
-            "--loops", help="List every loop candidate: scores, verdict and reason; how surely chunks are placed."
+            "--loops",
+            help="List every loop candidate with scores, verdict and reason, and the uncertainty of every chunk.",
         ),
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Say what a memory is: sessions, frames, scale, gravity, instances, loops.
+    """Summarise a memory: sessions, frames, scale, gravity, instances, loops.
 
     Example: list3r info house.l3r --loops
     """
@@ -63,9 +57,14 @@ def list_instances(
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
     min_confidence: Annotated[
         float | None,
-        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, listed or not."),
+        typer.Option(
+            "--min-confidence",
+            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+        ),
     ] = None,
-    at: Annotated[int | None, typer.Option("--at", metavar="SESSION", help="As it was after this session.")] = None,
+    at: Annotated[
+        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """List the instances with their place and size.
@@ -122,10 +121,11 @@ def show(
     ],
     json: JsonOption = False,
 ) -> None:
-    """Show one instance: where, how big, when seen, its relations, to each other the one that tells most.
+    """Show one instance: where it is, how big, when it was seen, and its most telling relation to each other one.
 
     Example: list3r show house.l3r 12
     """
+    from list3r.importers.base import imported_as
     from list3r.memory.library.labels import label_source
     from list3r.queries.path import telling
 
@@ -138,9 +138,10 @@ def show(
         parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations.of(instance.id)]
         units = scene.units
         named = scene.store.detected_labels.all().get(instance.id)
+        origin = imported_as(scene.store, instance.id)
     if json:
         related = [vars(r) for r in relations]
-        told = {"relations": related, "aliases": aliases, "observed_as": parts}
+        told = {"relations": related, "aliases": aliases, "observed_as": parts, "imported_as": origin}
         print_answer([{**instance_dict(instance, track), **label_source(instance, named), **told}], units)
         return
     say(f"{instance.id}  {instance.label or instance.description}")
@@ -153,6 +154,7 @@ def show(
         *(() if instance.label is None else (("named by", _named_by(instance, named)),)),
         ("seen", f"{instance.first_seen_s:.2f} s to {instance.last_seen_s:.2f} s, {instance.state}"),
         ("aliases", ", ".join(map(str, aliases)) or "none"),
+        *(() if origin is None else (("imported", f"from {origin['format']} as {', '.join(origin['names'])}"),)),
         *(() if track is None else _track_lines(*track, units)),
     ):
         say(f"  {key:11} {value}")

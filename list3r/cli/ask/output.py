@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from list3r.api import SceneMemory
-    from list3r.cli.ask.words import CameraWords
+    from list3r.cli.ask.arguments import CameraArguments
     from list3r.memory.records import BestView, Relation
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
@@ -25,38 +25,48 @@ if TYPE_CHECKING:
 Count = Annotated[int, typer.Option("-k", help="How many at most.")]
 MinConfidence = Annotated[
     float | None,
-    typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+    typer.Option(
+        "--min-confidence",
+        help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+    ),
 ]
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
 Label = Annotated[
     str | None,
-    typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these words."),
+    typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these given."),
 ]
 Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only things of this colour.")]
-MinSize = Annotated[float | None, typer.Option("--min-size", help="Longest edge at least this.")]
-MaxSize = Annotated[float | None, typer.Option("--max-size", help="Longest edge at most this.")]
+MinSize = Annotated[float | None, typer.Option("--min-size", help="Only things whose longest edge is at least this.")]
+MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only things whose longest edge is at most this.")]
 State = Annotated[
     str | None,
     typer.Option(
-        "--state", metavar="present|moved|removed|added|unseen|any", help="Only these; default: all but removed."
+        "--state",
+        metavar="present|moved|removed|added|unseen|any",
+        help="Only things in this state; default: all but removed.",
     ),
 ]
-Component = Annotated[int | None, typer.Option("--component", help="Only this part of a memory in parts.")]
+Component = Annotated[int | None, typer.Option("--component", help="Only this connected component.")]
 View = Annotated[int | None, typer.Option("--view", metavar="FRAME", help="What the camera of this frame sees.")]
-Time = Annotated[float | None, typer.Option("--time", metavar="S", help="The posed frame nearest to this second.")]
+Time = Annotated[
+    float | None,
+    typer.Option("--time", metavar="S", help="The camera of the posed frame nearest to this time, seconds."),
+]
 Pose = Annotated[
     str | None,
-    typer.Option("--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera put here and turned so (OpenCV axes)."),
+    typer.Option(
+        "--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera at this position with this rotation (OpenCV axes)."
+    ),
 ]
 SessionOption = Annotated[int | None, typer.Option("--session", help="The session of the frame or camera.")]
 MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera sees no further than this.")]
 
 
-def camera_from(scene: SceneMemory, words: CameraWords) -> PosedCamera | None:
+def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | None:
     """The camera that the options name; None for none of them. Raises `OptionError`."""
     from list3r.memory.errors import OptionError
 
-    view, time, pose, session = words.view, words.time, words.pose, words.session
+    view, time, pose, session = given.view, given.time, given.pose, given.session
     if sum(option is not None for option in (view, time, pose)) > 1:
         raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
     if view is None and time is None and pose is None:

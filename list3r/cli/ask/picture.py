@@ -12,11 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("picture")(picture)
-
-
 def picture(
     memory: MemoryArgument,
     instance_id: Annotated[
@@ -26,7 +21,7 @@ def picture(
     whole: Annotated[bool, typer.Option("--whole", help="The whole frame with its outline instead of a crop.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Write the stored picture that shows an instance best: most of it, unhidden and large enough.
+    """Write the stored picture that shows an instance best: most of it, unhidden, and large.
 
     Example: list3r picture house.l3r 12 --out mug.jpg
     """

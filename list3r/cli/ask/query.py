@@ -8,32 +8,26 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
+from list3r.cli.ask.arguments import (
+    OF_LOOKS,
+    CameraArguments,
+    FilterArguments,
+    NearArguments,
+    RegionArguments,
+    RelationArguments,
+    SimilarArguments,
+)
 from list3r.cli.ask.changes import changes
 from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
-from list3r.cli.ask.words import OF_LOOKS, CameraWords, FilterWords, LikeWords, NearWords, RegionWords, RelationWords
 from list3r.cli.catalog.questions import with_catalog
 from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memory, print_table, spread, with_at
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(
-        help="Ask what is near, inside, in sight, alike, related, described or changed.",
-        no_args_is_help=True,
-        rich_markup_mode=None,
-    )
-    for command in (nearest, within, relations, similar, find):
-        group.command(command.__name__)(with_at(with_catalog(spread(command))))
-    for other in (seen, path, changes):
-        group.command(other.__name__)(with_at(spread(other)))
-    app.add_typer(group, name="query")
-
-
 def nearest(
-    memory: MemoryArgument, near: NearWords, *, k: Count = 5, filters: FilterWords, json: JsonOption = False
+    memory: MemoryArgument, near: NearArguments, *, k: Count = 5, filters: FilterArguments, json: JsonOption = False
 ) -> None:
-    """The things nearest to a point or an instance, or that words name; distances of surfaces and of centres.
+    """The things nearest to a point or an instance, with distances of surfaces and of centres.
 
     Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
     """
@@ -56,14 +50,14 @@ def nearest(
 
 def within(
     memory: MemoryArgument,
-    region: RegionWords,
-    camera: Annotated[CameraWords, only("view", "pose", "session", "max_depth")],
+    region: RegionArguments,
+    camera: Annotated[CameraArguments, only("view", "pose", "session", "max_depth")],
     *,
-    occlusion: Annotated[bool, typer.Option(help="Whether a camera does not see what other things hide.")] = True,
-    filters: Annotated[FilterWords, only(*OF_LOOKS)],
+    occlusion: Annotated[bool, typer.Option(help="Leave out what other things hide from the camera.")] = True,
+    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
     json: JsonOption = False,
 ) -> None:
-    """The things inside a box, a sphere, or what a camera sees.
+    """The things inside a box or a sphere, or those that a camera sees.
 
     Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
     """
@@ -76,8 +70,8 @@ def within(
         print_matches(found, scene.units, json, total=len(found))
 
 
-def relations(memory: MemoryArgument, asked: RelationWords, json: JsonOption = False) -> None:
-    """Relations by any of subject, predicate and object; unknown where the memory cannot tell.
+def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False) -> None:
+    """The relations between things, by subject, predicate and object.
 
     Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
     """
@@ -87,13 +81,13 @@ def relations(memory: MemoryArgument, asked: RelationWords, json: JsonOption = F
 
 def similar(
     memory: MemoryArgument,
-    like: LikeWords,
+    like: SimilarArguments,
     *,
     k: Count = 5,
-    filters: Annotated[FilterWords, only(*OF_LOOKS)],
+    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
     json: JsonOption = False,
 ) -> None:
-    """The things that look most like one of them, or like a picture.
+    """The things that look most like one instance, or like a picture.
 
     Example: list3r query similar house.l3r --image mug.jpg --box 120,80,180,150
     """
@@ -112,15 +106,20 @@ def similar(
 
 def find(
     memory: MemoryArgument,
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="What it is and how it stands.", show_default=False)],
+    text: Annotated[
+        str,
+        typer.Argument(
+            metavar="TEXT", help="Description of the thing, and how it stands to others.", show_default=False
+        ),
+    ],
     k: Count = 5,
     viewpoint: Annotated[
         str | None,
-        typer.Option("--from", metavar="ID|camera|X,Y,Z", help="Who looks, for left, right, in front of and behind."),
+        typer.Option("--from", metavar="ID|camera|X,Y,Z", help="Viewpoint of left, right, in front of and behind."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """The things that a text describes: attributes, a noun, relations; ids may stand for things.
+    """The things that a text describes by attributes, a noun and relations; an id may stand for a thing.
 
     Example: list3r query find house.l3r "white mug on table"
     """
@@ -131,12 +130,12 @@ def find(
 
 def seen(
     memory: MemoryArgument,
-    options: CameraWords,
+    options: CameraArguments,
     instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
     structure: Structure = False,
     json: JsonOption = False,
 ) -> None:
-    """When an instance was seen, or what was to be seen at a time, in a frame, or from a pose.
+    """When an instance was seen, or what was visible at a time, in a frame, or from a pose.
 
     Example: list3r query seen house.l3r --time 12.5
     """
@@ -147,7 +146,7 @@ def seen(
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
         if camera is None and options.max_depth is not None:
-            raise OptionError("--max-depth is how far a camera sees; leave it out where an instance is named")
+            raise OptionError("--max-depth belongs to a camera; leave it out for an instance")
         if camera is not None:
             found = scene.visible(camera, max_depth=options.max_depth, structure=structure)
             if camera.frame is not None and not json:
@@ -185,15 +184,26 @@ def seen(
 
 def path(
     memory: MemoryArgument,
-    start: Annotated[int, typer.Argument(metavar="ID", help="From this instance.", show_default=False)],
-    end: Annotated[int, typer.Argument(metavar="ID", help="To this one.", show_default=False)],
-    structure: Annotated[bool, typer.Option(help="Whether the way may lead over floor and walls.")] = True,
+    start: Annotated[int, typer.Argument(metavar="ID", help="First instance.", show_default=False)],
+    end: Annotated[int, typer.Argument(metavar="ID", help="Second instance.", show_default=False)],
+    structure: Annotated[bool, typer.Option(help="Let the path lead over floor and walls.")] = True,
     json: JsonOption = False,
 ) -> None:
-    """How two things hang together: the fewest relations that lead from one to the other.
+    """The shortest chain of relations from one instance to another.
 
     Example: list3r query path house.l3r 12 4
     """
     with open_memory(memory) as scene:
         found = scene.path_between(start, end, structure=structure)
         print_relations(scene, found, json)
+
+
+questions = typer.Typer(
+    help="Ask what is near, inside, visible, similar, related, described by words, or changed.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+for command in (nearest, within, relations, similar, find):
+    questions.command(command.__name__)(with_at(with_catalog(spread(command))))
+for other in (seen, path, changes):
+    questions.command(other.__name__)(with_at(spread(other)))

@@ -29,24 +29,29 @@ class BatchPlace:
 
     engine: Annotated[str, typer.Option("--engine", metavar="local|ray", help="What runs the tasks.")] = "local"
     address: Annotated[
-        str | None, typer.Option("--address", metavar="ADDRESS", help="Of the Ray cluster; default: RAY_ADDRESS.")
+        str | None,
+        typer.Option("--address", metavar="ADDRESS", help="Address of the Ray cluster; default: RAY_ADDRESS."),
     ] = None
-    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Tasks side by side; default: what fits.")] = (
-        None
-    )
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Tasks at the same time; default: as many as fit.")
+    ] = None
     cpus: Annotated[int, typer.Option("--cpus", metavar="N", help="Cores of one task.")] = 1
     task_memory: Annotated[
         float | None, typer.Option("--task-memory", metavar="GIB", help="Memory of one task; default: not counted.")
     ] = None
     gpus: Annotated[float, typer.Option("--gpus", metavar="N", help="GPUs of one task, or a share of one.")] = 0.0
     retries: Annotated[
-        int, typer.Option("--retries", metavar="N", help="Tries again where a process was ended from outside.")
+        int, typer.Option("--retries", metavar="N", help="How often a task is repeated after its process was killed.")
     ] = 3
     scratch: Annotated[
-        Path | None, typer.Option("--scratch", metavar="DIR", help="On each machine's own disk, for what is under way.")
+        Path | None,
+        typer.Option("--scratch", metavar="DIR", help="Folder on each machine's own disk for unfinished memories."),
     ] = None
     state: Annotated[
-        Path | None, typer.Option("--state", metavar="FILE", help="The manifest; default: batch.sqlite in --out.")
+        Path | None,
+        typer.Option(
+            "--state", metavar="FILE", help="File with the state of every task; default: batch.sqlite in --out."
+        ),
     ] = None
 
 
@@ -58,15 +63,11 @@ class BatchTasks:
         int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
     ] = None
     script: Annotated[
-        str | None, typer.Option("--print", metavar="WHAT", help="Print a script instead: slurm, an array job.")
+        str | None,
+        typer.Option("--print", metavar="WHAT", help="Print a script instead of building: slurm, an array job."),
     ] = None
     onto: Annotated[bool, typer.Option("--onto", help="Add videos to memories that no batch made.")] = False
     force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("batch")(batch)
 
 
 @spread
@@ -74,7 +75,7 @@ def batch(
     videos: Annotated[
         str,
         typer.Argument(
-            metavar="MANIFEST|FOLDER", help="A file with a video a line, or what holds videos.", show_default=False
+            metavar="MANIFEST|FOLDER", help="A list with one video per line, or a folder of videos.", show_default=False
         ),
     ],
     out: Annotated[str, typer.Option("--out", metavar="DIR", help="Folder or URL of the memories.")],
@@ -82,15 +83,15 @@ def batch(
     place: BatchPlace,
     tasks: BatchTasks,
     request: BuildRequest,
-    words: src.SourceWords,
+    given: src.SourceArguments,
     run: Annotated[RunOptions, _RUN],
     json: JsonOption = False,
 ) -> None:
-    """Build the memories of many videos, one task a video; given again it does what is not done.
+    """Build the memories of many videos, one task per video. Run again, it does only what is not done yet.
 
     Example: list3r batch walks/ --out memories/
     """
-    groups = _read(videos, words, request, run)
+    groups = _read(videos, given, request, run)
     from list3r.batch.engines.base import TaskResources, make_engine  # after a list that may be refused
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
@@ -104,7 +105,7 @@ def batch(
     )
     if tasks.script is not None:
         if tasks.script != "slurm":
-            raise OptionError(f"--print {tasks.script} is not known; slurm is")
+            raise OptionError(f"--print {tasks.script} is not known; give slurm")
         write(slurm_script(_without_print(sys.argv[1:]), len(groups), resources, place.jobs))
         return
     try:
@@ -117,18 +118,18 @@ def batch(
                 groups, make_engine(place.engine, resources, place.jobs, place.address), settings, _told(json)
             )
     except KeyboardInterrupt:
-        note("", "interrupted; what is done stays, give the same command again to go on")
+        note("", "interrupted; finished memories stay; give the same command again to continue")
         raise typer.Exit(1) from None
     _say(report, json)
     if report.failed:
         raise typer.Exit(1)
 
 
-def _read(videos: str, words: src.SourceWords, request: BuildRequest, run: RunOptions) -> list[list[BatchTask]]:
+def _read(videos: str, given: src.SourceArguments, request: BuildRequest, run: RunOptions) -> list[list[BatchTask]]:
     """Return the videos of each memory, before what builds them is loaded."""
     from list3r.batch.tasks import Asked, read_tasks
 
-    return read_tasks(videos, Asked(lambda fields: replace(words, **fields).options(), request, run))
+    return read_tasks(videos, Asked(lambda fields: replace(given, **fields).options(), request, run))
 
 
 def _told(quiet: bool) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from list3r.cli.build.source_options import SourceWords
+from list3r.cli.build.source_options import SourceArguments
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 
@@ -13,5 +13,5 @@ class BuildOptions:
     """How a video is read and reconstructed, and how the work runs, as options."""
 
     request: BuildRequest
-    words: SourceWords
+    given: SourceArguments
     run: RunOptions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,19 +18,12 @@ if TYPE_CHECKING:
     from list3r.pipeline.reports import BuildReport
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("inspect")(inspect)
-    app.command("build")(build)
-    app.command("demo")(demo)
-
-
 @spread
 def inspect(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
-    words: src.SourceWords,
+    given: src.SourceArguments,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the colour camera and the depth-to-colour transform.")
     ] = False,
@@ -40,16 +32,16 @@ def inspect(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Say what a source holds: kind, frames, size, depth, intrinsics, poses, and what is missing.
+    """Say what a source contains: format, frames, size, depth, intrinsics, poses, and what is missing.
 
     Example: list3r inspect walk.mp4 --json
     """
     from list3r.exporters.output import replacing
     from list3r.frames.inspection import SourceReport, draw_registration
-    from list3r.frames.pose_agreement import scale_doubts
+    from list3r.frames.pose_agreement import disagreements
     from list3r.frames.source import open_source
 
-    options = words.options(more)
+    options = given.options(more)
     if overlay is not None:
         _check_overlay(overlay, Path(source))
     opened = open_source(source, options)
@@ -62,8 +54,7 @@ def inspect(
     if overlay is not None:
         with replacing(overlay) as temporary:
             draw_registration(opened, temporary)
-    info = replace(opened.info, notes=(*opened.info.notes, *scale_doubts(opened)))
-    report = SourceReport(info, found, overlay)
+    report = SourceReport(opened.info, found, overlay, disagreements(opened))
     if json:
         print_answer([report.as_dict()])
     else:
@@ -79,7 +70,7 @@ def _check_overlay(overlay: Path, source: Path) -> None:
         raise OptionError(f"--overlay {overlay}: the picture must end in .png")
     check_target(overlay)
     if overlay.exists() and overlay.resolve().is_relative_to(source.resolve()):
-        raise OptionError(f"--overlay {overlay} is a picture of the source; name another file")
+        raise OptionError(f"--overlay {overlay} is a picture of the source itself; name another file")
 
 
 @spread
@@ -90,7 +81,8 @@ def build(
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
     asked: BuildOptions,
     debug: Annotated[
-        Path | None, typer.Option("--debug", metavar="DIR", help="Write overlays of masks and tracks there.")
+        Path | None,
+        typer.Option("--debug", metavar="DIR", help="Write pictures of masks, tracks and loops to this folder."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -98,7 +90,7 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    options = asked.words.options(more)
+    options = asked.given.options(more)
     from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:
@@ -112,9 +104,9 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the walk, the memory and the exports.")
     ] = Path("list3r-demo"),
-    seed: Annotated[int, typer.Option("--seed", help="Another seed furnishes other rooms.")] = 1,
-    frames: Annotated[int, typer.Option("--frames", help="Length of the walk.")] = 300,
-    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Processes.")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Another seed gives other rooms.")] = 1,
+    frames: Annotated[int, typer.Option("--frames", help="Length of the walk, frames.")] = 300,
+    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Worker processes.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Simulate a walk through two furnished rooms, build its memory, ask it, export it. Nothing is downloaded.

@@ -18,23 +18,21 @@ if TYPE_CHECKING:
     from list3r.reconstruction.outputs.base import OutputOptions
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("convert")(convert)
-    app.command("import")(import_map)
-
-
 @dataclass(frozen=True)
-class PredictionWords:
-    """What is known of the predictions of a network, as options."""
+class PredictionArguments:
+    """Options that describe the predictions of a network."""
 
     frame_size: Annotated[
         str | None,
-        typer.Option("--frame-size", metavar="WxH", help="Of predictions: size of the video's frames, where cut."),
+        typer.Option(
+            "--frame-size",
+            metavar="WxH",
+            help="For predictions: size of the video's frames, if the network cropped them.",
+        ),
     ] = None
     masks: Annotated[
         Path | None,
-        typer.Option("--masks", metavar="DIR", help="Of predictions: things, as EntitySAM saves them."),
+        typer.Option("--masks", metavar="DIR", help="For predictions: folder of masks that EntitySAM saved."),
     ] = None
 
 
@@ -46,11 +44,13 @@ def convert(
     to: Annotated[
         str,
         typer.Option(
-            "--to", metavar="LAYOUT", help="tum, transforms, colmap, replica, r3d; of predictions: precomputed."
+            "--to",
+            metavar="LAYOUT",
+            help="tum, transforms, colmap, replica or r3d; for predictions of networks: precomputed.",
         ),
     ],
-    predictions: PredictionWords,
-    words: src.SourceWords,
+    predictions: PredictionArguments,
+    given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
     """Write the frames of any source in a layout that other programs read.
@@ -61,12 +61,12 @@ def convert(
         from list3r.reconstruction.outputs.base import OutputOptions
 
         size = predictions.frame_size
-        options = OutputOptions(words.every, None if size is None else read_size(size), predictions.masks)
+        options = OutputOptions(given.every, None if size is None else read_size(size), predictions.masks)
         _convert_predictions(Path(source), folder, options, json)
         return
     from list3r.frames.convert import convert as write
 
-    report = write(source, to, folder, words.options())
+    report = write(source, to, folder, given.options())
     if json:
         print_answer([report.as_dict()])
         return
@@ -96,7 +96,7 @@ def _convert_predictions(source: Path, folder: Path, options: OutputOptions, jso
 
 
 def import_map(
-    source: Annotated[str, typer.Argument(metavar="MAP", help="A file or folder of another program.")],
+    source: Annotated[str, typer.Argument(metavar="MAP", help="The map: a file or folder of another program.")],
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
     kind: Annotated[
         str, typer.Option("--format", metavar="FORMAT", help="conceptgraphs, hovsg, hydra, colmap, ply or auto.")
@@ -104,7 +104,7 @@ def import_map(
     up: Annotated[str, typer.Option("--up", metavar="AXIS", help="The axis of the map that points up.")] = "z",
     json: JsonOption = False,
 ) -> None:
-    """Make a memory of a map that another program made: its things, related and found by the rules of this one.
+    """Make a memory from a map of another program. Relations, search and exports work as for any memory.
 
     Example: list3r import dsg.json -m house.l3r
     """

@@ -1,4 +1,4 @@
-"""The options that say what is known of a source; the same words on every command that reads one."""
+"""The options that describe a source, the same on every command that reads one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SourceArgument = Annotated[
     str,
     typer.Argument(
         metavar="SOURCE",
-        help="A video file, a folder of frames; build: also a webcam (/dev/video0), a stream's URL, record3d:.",
+        help="A video file or a folder of frames; for build also a webcam (/dev/video0), a stream's URL or record3d:.",
         show_default=False,
     ),
 ]
@@ -23,7 +23,7 @@ MoreArgument = Annotated[
     typer.Argument(metavar="MORE", help="Further video files of the same recording, in order.", show_default=False),
 ]
 Kind = Annotated[
-    str, typer.Option("--kind", metavar="FORMAT", help="What the source is: auto, or one of docs/sources.md.")
+    str, typer.Option("--kind", metavar="FORMAT", help="Format of the source: auto, or a name from docs/sources.md.")
 ]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Take every N-th frame.")]
 Frames = Annotated[
@@ -43,7 +43,7 @@ DepthToColor = Annotated[
     typer.Option(
         "--depth-to-color",
         metavar="TRANSFORM",
-        help="Depth camera to colour camera: tx,ty,tz,qx,qy,qz,qw in metres, or a 4x4 matrix row by row, or a file.",
+        help="From depth camera to colour camera: tx,ty,tz,qx,qy,qz,qw in metres, a 4x4 matrix row by row, or a file.",
     ),
 ]
 Topics = Annotated[
@@ -51,11 +51,11 @@ Topics = Annotated[
     typer.Option(
         "--topics",
         metavar="ROLE=TOPIC,...",
-        help="Topics of a ROS recording: color=/a,depth=/b,pose=/c, or cameras of LeRobot; default: those that fit.",
+        help="Topics of a ROS recording (color=/a,depth=/b,pose=/c) or cameras of LeRobot; default: those that fit.",
     ),
 ]
 Episode = Annotated[
-    int | None, typer.Option("--episode", metavar="N", help="Episode of a data set of LeRobot.", show_default=False)
+    int | None, typer.Option("--episode", metavar="N", help="Episode of a LeRobot data set.", show_default=False)
 ]
 Registered = Annotated[bool, typer.Option("--registered", help="Depth already lies on the colour image's pixels.")]
 DepthScale = Annotated[
@@ -66,16 +66,20 @@ Fps = Annotated[
     typer.Option(
         "--fps",
         metavar="RATE",
-        help="Take so many frames a second; of a source without a clock, the rate it was filmed at.",
+        help="Frames to take per second; for a source without a clock, the rate it was filmed at.",
     ),
 ]
-Start = Annotated[float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the first frame.")]
-End = Annotated[float | None, typer.Option("--end", metavar="SECONDS", help="Stop so long after the first frame.")]
+Start = Annotated[
+    float | None, typer.Option("--start", metavar="SECONDS", help="Begin this many seconds after the first frame.")
+]
+End = Annotated[
+    float | None, typer.Option("--end", metavar="SECONDS", help="Stop this many seconds after the first frame.")
+]
 Sharpest = Annotated[
     bool | None,
     typer.Option(
         "--sharpest/--no-sharpest",
-        help="With --every or --fps, take the sharpest of each so many frames; default: of videos.",
+        help="With --every or --fps, take the sharpest frame of each group; default: on for videos.",
         show_default=False,
     ),
 ]
@@ -84,14 +88,14 @@ MaxSide = Annotated[
     typer.Option(
         "--max-side",
         metavar="PX",
-        help="Reduce larger pictures to this (0: never); default: 960, with depth 1280.",
+        help="Reduce larger pictures to this side (0: never); default: 960, with depth 1280.",
         show_default=False,
     ),
 ]
 
 
 @dataclass(frozen=True)
-class SourceWords:
+class SourceArguments:
     """The options above as they were given."""
 
     kind: Kind = "auto"
@@ -112,21 +116,21 @@ class SourceWords:
     max_side: MaxSide = None
 
     def options(self, more: list[str] | None = None) -> SourceOptions:
-        """What they mean, with further files of the recording. Raises `OptionError` naming the option."""
-        from list3r.frames import options as words
+        """Return what they mean, with further files of the recording. Raises `OptionError` naming the option."""
+        from list3r.frames import options as parsing
 
-        first, stop = words.parse_range(self.frames) if self.frames else (None, None)
+        first, stop = parsing.parse_range(self.frames) if self.frames else (None, None)
         color, depth, transform = self.intrinsics, self.depth_intrinsics, self.depth_to_color
-        return words.SourceOptions(
+        return parsing.SourceOptions(
             kind=self.kind,
             every=self.every,
             start=first,
             stop=stop,
-            intrinsics=words.parse_intrinsics(color, "--intrinsics") if color else None,
-            distortion=words.parse_distortion(self.distortion) if self.distortion else None,
-            depth_intrinsics=words.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
-            T_color_depth=words.parse_transform(transform, "--depth-to-color") if transform else None,
-            topics=words.parse_topics(self.topics) if self.topics else None,
+            intrinsics=parsing.parse_intrinsics(color, "--intrinsics") if color else None,
+            distortion=parsing.parse_distortion(self.distortion) if self.distortion else None,
+            depth_intrinsics=parsing.parse_intrinsics(depth, "--depth-intrinsics") if depth else None,
+            T_color_depth=parsing.parse_transform(transform, "--depth-to-color") if transform else None,
+            topics=parsing.parse_topics(self.topics) if self.topics else None,
             episode=self.episode,
             registered=self.registered,
             depth_scale=self.depth_scale,

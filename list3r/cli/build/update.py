@@ -1,11 +1,9 @@
-"""update: one more video for a memory."""
+"""update: a later video for a memory."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import typer
 
 from list3r.cli.build import source_options as src
 from list3r.cli.build.build_options import BuildOptions
@@ -14,11 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, spread
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import UpdateReport
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("update")(update)
 
 
 @spread
@@ -30,15 +23,15 @@ def update(
     asked: BuildOptions,
     json: JsonOption = False,
 ) -> None:
-    """Add one more video to a memory: it is placed against what is stored, and what has changed is written down.
+    """Add a later video to a memory: place it in the same world, and record what has changed.
 
     Example: list3r update house.l3r walk-2/
     """
-    options = asked.words.options(more)
+    options = asked.given.options(more)
     from list3r.pipeline.update import update as update_memory
 
     def interrupted(begun: bool) -> str:
-        return f"interrupted; {memory} keeps what it knew and the finished chunks: go on with --resume"
+        return f"interrupted; {memory} is unchanged but for the finished chunks; continue with --resume"
 
     def work() -> UpdateReport:
         with watching("updating", interrupted, quiet=json) as watch:
@@ -48,7 +41,7 @@ def update(
 
 
 def report_lines(memory: Path, report: UpdateReport) -> list[str]:
-    """What an update did, for people."""
+    """Return what an update did, for people."""
     events = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in report.events.items())
     lines = [
         f"{memory}  session {report.session}",

@@ -31,25 +31,19 @@ Files = Annotated[list[str], typer.Argument(metavar="FILE...", help="Memory file
 _DEFAULT = "catalog.sqlite"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(help="Many memories in one catalogue.", no_args_is_help=True, rich_markup_mode=None)
-    for name, command in (("add", add), ("remove", remove), ("list", list_), ("check", check), ("rebuild", rebuild)):
-        group.command(name)(command)
-    app.add_typer(group, name="catalog")
-
-
 def add(
     files: Files,
     catalog: CatalogOption = _DEFAULT,
-    name: Annotated[str | None, typer.Option("--name", help="Of one memory; default: that of its file.")] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Name of the memory, if only one is added; default: that of its file.")
+    ] = None,
     store: Annotated[
         str | None,
-        typer.Option("--store", metavar="DIR", help="Keep a copy there that never changes: a folder or URL."),
+        typer.Option("--store", metavar="DIR", help="Keep a copy that never changes in this folder or URL."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Take memories into the catalogue; one of a name that is there takes its place, with the next revision.
+    """Add memories to the catalogue; a memory with a known name replaces the earlier one as its next revision.
 
     Example: list3r catalog add memories/ --catalog postgresql://db.example/list3r
     """
@@ -57,7 +51,7 @@ def add(
 
     found = list(_memories(files))
     if name is not None and len(found) != 1:
-        raise OptionError(f"--name {name} is of one memory; {len(found)} are given")
+        raise OptionError(f"--name {name} names one memory, but {len(found)} are given")
     with _opened(catalog, make=True) as opened:
         with opened.loading(len(found)):
             entries = [asdict(opened.add(path, name, store)) for path in found]
@@ -72,7 +66,7 @@ def remove(
     catalog: CatalogOption = _DEFAULT,
     json: JsonOption = False,
 ) -> None:
-    """Forget memories; their files stay.
+    """Remove memories from the catalogue; their files stay.
 
     Example: list3r catalog remove kitchen
     """
@@ -86,7 +80,7 @@ def remove(
 
 
 def list_(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
-    """All memories of the catalogue.
+    """List the memories of the catalogue.
 
     Example: list3r catalog list --catalog catalog.sqlite
     """
@@ -99,31 +93,37 @@ def list_(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
 
 
 def check(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
-    """Tell which files have changed or gone since they were catalogued; status 1 where any has.
+    """List files that have changed or disappeared since they were added; status 1 if there are any.
 
     Example: list3r catalog check
     """
     from list3r.catalog.catalog import is_stale
 
     with _opened(catalog) as opened:
-        stale = [e for e in opened.memories() if is_stale(e)]
+        known = opened.memories()
+    stale = [e for e in known if is_stale(e)]
     if json:
         print_answer(map(asdict, stale), total=len(stale))
+    elif known and not stale:
+        note(f"{len(known)} {'memory is' if len(known) == 1 else 'memories are'} as catalogued")
     else:
         print_table([[e.name, e.revision, e.instances, e.path] for e in stale], _HEADER)
     if stale:
-        note(f"{len(stale)} changed or gone; `list3r catalog add FILE` takes one in again")
+        note(f"{len(stale)} changed or gone; `list3r catalog add FILE` adds the present file")
         raise typer.Exit(1)
 
 
 def rebuild(
     files: Annotated[
-        list[str] | None, typer.Argument(metavar="[FILE...]", help="Memory files, or folders; default: those it knows.")
+        list[str] | None,
+        typer.Argument(
+            metavar="[FILE...]", help="Memory files, or folders of them; default: those that the catalogue knows."
+        ),
     ] = None,
     catalog: CatalogOption = _DEFAULT,
     json: JsonOption = False,
 ) -> None:
-    """Write the catalogue anew from the files; what is not among them is forgotten.
+    """Write the catalogue again from the files; memories that are not among them are removed.
 
     Example: list3r catalog rebuild memories/
     """
@@ -162,3 +162,10 @@ def _memories(files: Sequence[str]) -> Iterator[str]:
         if not found:
             raise OptionError(f"{file} holds no memory (*.l3r)")
         yield from found
+
+
+catalogue = typer.Typer(
+    help="Keep many memories in one catalogue, and ask them together.", no_args_is_help=True, rich_markup_mode=None
+)
+for name, command in (("add", add), ("remove", remove), ("list", list_), ("check", check), ("rebuild", rebuild)):
+    catalogue.command(name)(command)

@@ -27,9 +27,9 @@ _TOLD = {
     "similar": ("id", "image", "box", "k", "min_confidence", "structure", "everywhere"),
     "relations": ("subject", "predicate", "object", "min_confidence"),
 }
-"""By question, the words that a catalogue can answer."""
+"""By question, the arguments that a catalogue can answer."""
 _MOST_RELATIONS = 1000
-Words = dict[str, Any]
+Arguments = dict[str, Any]
 
 
 def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,15 +49,15 @@ def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
     added = [inspect.Parameter(n, keyword, default=defaults[n], annotation=kind) for n, kind in kinds.items()]
 
     @functools.wraps(command)
-    def asked(**words: Any) -> Any:
-        url, everywhere = words.pop("catalog", None), words.pop("everywhere", False)
+    def asked(**arguments: Any) -> Any:
+        url, everywhere = arguments.pop("catalog", None), arguments.pop("everywhere", False)
         if url is None:
             if everywhere:
-                raise _option_error("--everywhere goes with --catalog URL")
-            return command(**words)
-        json, memory = words.pop("json"), str(words.pop("memory"))
-        _check(name, words, signature)
-        _ask(url, name, None if memory == ALL else memory, {**words, "everywhere": everywhere}, json)
+                raise _option_error("--everywhere needs --catalog URL")
+            return command(**arguments)
+        json, memory = arguments.pop("json"), str(arguments.pop("memory"))
+        _check(name, arguments, signature)
+        _ask(url, name, None if memory == ALL else memory, {**arguments, "everywhere": everywhere}, json)
 
     asked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
     asked.__annotations__ = {**get_type_hints(command, include_extras=True), **kinds}
@@ -70,85 +70,87 @@ def _option_error(text: str) -> Exception:
     return OptionError(text)
 
 
-def _check(name: str, words: Words, signature: inspect.Signature) -> None:
+def _check(name: str, arguments: Arguments, signature: inspect.Signature) -> None:
     """Raise `OptionError` for what is asked that only a file can tell."""
     if asked_at() is not None:
-        raise _option_error("--at is a question to one file; leave it out, or ask the file")
-    for word, value in words.items():
+        raise _option_error("--at cannot be asked of a catalogue; leave it out, or ask the memory file")
+    for word, value in arguments.items():
         if word not in _TOLD[name] and value != signature.parameters[word].default:
             told = word.replace("_", "-")
-            raise _option_error(f"--{told} is a question to one file; leave it out, or ask the file")
+            raise _option_error(f"--{told} cannot be asked of a catalogue; leave it out, or ask the memory file")
 
 
-def _ask(url: str, name: str, memory: str | None, words: Words, json: bool) -> None:
+def _ask(url: str, name: str, memory: str | None, arguments: Arguments, json: bool) -> None:
     from list3r.catalog import Catalog
     from list3r.catalog.records import CatalogFilters
 
     filters = CatalogFilters(
-        bool(words.get("structure")), float(words.get("min_confidence") or 0.0), words.get("state")
+        bool(arguments.get("structure")), float(arguments.get("min_confidence") or 0.0), arguments.get("state")
     )
     with Catalog.open(url, make=False) as catalog:
         if name == "relations":
-            found = catalog.relations(memory, **{w: words[w] for w in _TOLD[name][:3]}, k=_MOST_RELATIONS)
+            found = catalog.relations(memory, **{w: arguments[w] for w in _TOLD[name][:3]}, k=_MOST_RELATIONS)
             rows = [r for r in found if r.confidence >= filters.min_confidence]
             _print(rows, found, json, _relation_row, _RELATIONS)
             return
         ask = {"nearest": _nearest, "within": _within, "find": _find, "similar": _similar}[name]
-        found = ask(catalog, memory, words, filters)
+        found = ask(catalog, memory, arguments, filters)
     _print(list(found), found, json, _match_row, _MATCHES)
 
 
 def _one(memory: str | None) -> str:
     if memory is None:
-        raise _option_error(f"a place is one of one memory; name that instead of {ALL}")
+        raise _option_error(f"a place belongs to one memory; name that instead of {ALL}")
     return memory
 
 
-def _nearest(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
-    point, near, told = words["point"], words["id"], words["words"]
+def _nearest(catalog: Catalog, memory: str | None, arguments: Arguments, filters: CatalogFilters) -> CatalogAnswers:
+    point, near, told = arguments["point"], arguments["id"], arguments["words"]
     if told is not None and (point is not None or near is not None):
-        raise _option_error("words and a place together are a question to one file; leave one of them out")
+        raise _option_error("a catalogue takes words or a place, not both; leave one out")
     if told is not None:
-        return catalog.find(told, memory, k=words["k"], filters=filters)
+        return catalog.find(told, memory, k=arguments["k"], filters=filters)
     at = None if point is None else parse_point(point, "--point")
-    return catalog.nearest(_one(memory), point=at, instance_id=near, k=words["k"], filters=filters)
+    return catalog.nearest(_one(memory), point=at, instance_id=near, k=arguments["k"], filters=filters)
 
 
-def _within(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
-    from list3r.cli.ask.words import CameraWords, RegionWords
+def _within(catalog: Catalog, memory: str | None, arguments: Arguments, filters: CatalogFilters) -> CatalogAnswers:
+    from list3r.cli.ask.arguments import CameraArguments, RegionArguments
 
-    region = RegionWords(words["box"], words["point"], words["radius"]).lengths(CameraWords())
+    region = RegionArguments(arguments["box"], arguments["point"], arguments["radius"]).lengths(CameraArguments())
     return catalog.within(_one(memory), **region, filters=filters)  # type: ignore[arg-type]
 
 
-def _find(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
-    return catalog.find(words["text"], memory, k=words["k"], filters=filters)
+def _find(catalog: Catalog, memory: str | None, arguments: Arguments, filters: CatalogFilters) -> CatalogAnswers:
+    return catalog.find(arguments["text"], memory, k=arguments["k"], filters=filters)
 
 
-def _similar(catalog: Catalog, memory: str | None, words: Words, filters: CatalogFilters) -> CatalogAnswers:
-    anywhere = memory is None or words["everywhere"]
-    asked: Words = {"anywhere": anywhere, "k": words["k"], "filters": filters}
-    if words["image"] is None:
-        return catalog.similar(memory, instance_id=words["id"], **asked)
-    vector, space = _picture(catalog, memory, words)
+def _similar(catalog: Catalog, memory: str | None, arguments: Arguments, filters: CatalogFilters) -> CatalogAnswers:
+    anywhere = memory is None or arguments["everywhere"]
+    asked: Arguments = {"anywhere": anywhere, "k": arguments["k"], "filters": filters}
+    if arguments["image"] is None:
+        return catalog.similar(memory, instance_id=arguments["id"], **asked)
+    vector, space = _picture(catalog, memory, arguments)
     return catalog.similar(memory, vector=vector, space=space, **asked)
 
 
-def _picture(catalog: Catalog, memory: str | None, words: Words) -> tuple[Any, str]:
+def _picture(catalog: Catalog, memory: str | None, arguments: Arguments) -> tuple[Any, str]:
     """Return the vector of a picture, by the model of the first memory that can be opened here, and its space."""
     from list3r.api import open as open_scene
-    from list3r.cli.ask.words import LikeWords
+    from list3r.cli.ask.arguments import SimilarArguments
     from list3r.semantics.picture_query import picture_query
 
     entries = catalog.memories() if memory is None else [catalog.memory(memory)]
     path = next((e.path for e in entries if Path(e.path).is_file()), None)
     if path is None:
-        raise _option_error("no file of the catalogue lies on this machine, which names the model of the picture")
-    like = LikeWords(words["id"], words["image"], words["box"])
+        raise _option_error(
+            "no memory file of the catalogue is on this machine to say which model describes the picture"
+        )
+    like = SimilarArguments(arguments["id"], arguments["image"], arguments["box"])
     with open_scene(path) as scene:
-        asked = picture_query(scene.store, words["image"], like.corners())
+        asked = picture_query(scene.store, arguments["image"], like.corners())
     if asked.part is not None:
-        raise _option_error("pictures are compared by vectors of a model; `list3r embed` makes those of the memories")
+        raise _option_error("the memories have no vectors to compare pictures with; `list3r embed` makes them")
     return asked.vector, asked.space
 
 

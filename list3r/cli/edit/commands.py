@@ -19,17 +19,7 @@ if TYPE_CHECKING:
 IdArgument = Annotated[
     int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
 ]
-AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Who says so; you, unless told.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("merges")(merges)
-    app.command("undo")(undo)
-    app.command("merge")(merge)
-    app.command("split")(split)
-    app.command("label")(label)
-    app.command("delete")(delete)
+AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Author of the edit; default: you.")]
 
 
 def merges(
@@ -84,7 +74,7 @@ def undo(
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Take back an edit, or a decision of the merge log; ids that had retired come back.
+    """Undo an edit or a merge decision; ids that were retired come back.
 
     Example: list3r undo house.l3r 41
     """
@@ -113,8 +103,8 @@ def split(
         typer.Option(
             "--out",
             metavar="CHUNK:LOCAL,...",
-            help="What leaves it, by chunk and local id (see `observed_as` of `list3r show --json`); "
-            "without it, where the evidence parts it best.",
+            help="Local instances that leave it (see `observed_as` of `list3r show --json`); "
+            "default: split where the evidence does.",
         ),
     ] = None,
     author: AuthorOption = None,
@@ -131,7 +121,7 @@ def split(
 def label(
     memory: MemoryArgument,
     instance_id: IdArgument,
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="Its name; '' takes it away.", show_default=False)],
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="The name; '' removes it.", show_default=False)],
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -145,7 +135,7 @@ def label(
 def delete(
     memory: MemoryArgument, instance_id: IdArgument, author: AuthorOption = None, json: JsonOption = False
 ) -> None:
-    """Take an instance out of the memory, with all that is seen of it later; undo brings it back.
+    """Remove an instance, also from later sessions; undo brings it back.
 
     Example: list3r delete house.l3r 12
     """

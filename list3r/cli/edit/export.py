@@ -29,26 +29,27 @@ _FORMAT_OPTION = typer.Option(
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("export")(export)
-
-
 @dataclass(frozen=True)
-class ExportWords:
-    """Options of some formats; what is left out is their default."""
+class ExportArguments:
+    """Options of some formats. What is left out takes the default of the format."""
 
     color: str | None = field(default=None, metadata=option("ply, glb: rgb (as seen) or instance.", "rgb|instance"))
-    tokens: int | None = field(default=None, metadata=option("prompt: tokens of the text at most (2000).", "N"))
-    question: str | None = field(default=None, metadata=option("prompt: what to put first.", "TEXT"))
-    mesh: bool = field(default=False, metadata=option("usd: a closed mesh of each instance in place of its points."))
-    colliders: bool = field(default=False, metadata=option("usd: meshes that collide."))
+    tokens: int | None = field(default=None, metadata=option("prompt: most tokens of the text; default: 2000.", "N"))
+    question: str | None = field(
+        default=None, metadata=option("prompt: a question; what it asks about comes first.", "TEXT")
+    )
+    mesh: bool = field(
+        default=False, metadata=option("usd: write a closed mesh of each instance instead of its points.")
+    )
+    colliders: bool = field(default=False, metadata=option("usd: write meshes with colliders."))
     density: float | None = field(
         default=None, metadata=option("simready: kg per cubic metre of the hull, for an estimated mass.", "KG/M3")
     )
     ids: str | None = field(default=None, metadata=option("simready: only these things, such as 3,7,12.", "ID,..."))
 
-    workers: int | None = field(default=None, metadata=option("simready: processes; 0: none beside this one.", "N"))
+    workers: int | None = field(
+        default=None, metadata=option("simready: worker processes; 0: work in this process.", "N")
+    )
 
     def given(self) -> dict[str, Any]:
         """Return the options that are not left out. Raises `OptionError`."""
@@ -68,12 +69,17 @@ def _ids(text: str) -> tuple[int, ...]:
 def export(
     memory: MemoryArgument,
     to: Annotated[str, _FORMAT_OPTION],
-    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for a pipe.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for standard output.")
+    ],
     *,
-    words: ExportWords,
+    words: ExportArguments,
     min_confidence: Annotated[
         float | None,
-        typer.Option("--min-confidence", help="All that is at least this sure to be one thing, unlisted scraps too."),
+        typer.Option(
+            "--min-confidence",
+            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -87,7 +93,7 @@ def export(
     options = words.given()
     if out == Path("-"):
         if json:
-            raise OptionError("--out - takes standard output, --json too; leave one of them out")
+            raise OptionError("--out - and --json both write to standard output; leave one out")
         with open_memory(memory, min_confidence) as scene:
             _pipe(scene, to, options)
         return
@@ -119,10 +125,10 @@ def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
 
     form = find_format(to)
     if form.folder:
-        raise OptionError(f"{to} is a folder and cannot be piped; name one with --out")
+        raise OptionError(f"{to} is a folder and cannot go to standard output; name a folder with --out")
     with tempfile.TemporaryDirectory() as folder:
         first, *others = scene.export(to, Path(folder) / f"{scene.path.stem}{form.suffixes[0]}", **options)
         with first.open("rb") as file:
             shutil.copyfileobj(file, sys.stdout.buffer)
     for other in others:
-        note(f"note: {other.name} is left out of the pipe; it is written beside a file")
+        note(f"note: {other.name} is not written to standard output; with a file in --out it is written beside it")

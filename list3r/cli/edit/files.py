@@ -12,13 +12,6 @@ from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_tab
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("verify")(verify)
-    app.command("repair")(repair)
-    app.command("doctor")(doctor)
-
-
 def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
     """Check every page, checksum and reference of a memory; status 1 when damage is found.
 
@@ -69,11 +62,14 @@ def _is_broken(memory: Path, error: Exception) -> bool:
 def repair(
     memory: MemoryArgument,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write the sound file there; default: in its place.")
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="Write the repaired file here; default: in place of the damaged one."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Salvage a damaged memory: keep every sound row, derive the rest anew, say what is lost. The original is kept.
+    """Repair a damaged memory: keep every sound row, derive the rest again, list what is lost. The original is kept.
 
     Example: list3r repair house.l3r
     """

@@ -12,11 +12,6 @@ from list3r.cli.edit.commands import AuthorOption
 from list3r.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("scale")(scale)
-
-
 def scale(
     memory: MemoryArgument,
     anchor: Annotated[
@@ -32,7 +27,7 @@ def scale(
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say how long something is, so that lengths are metres; without --anchor, show what is known of the scale.
+    """Give one known length, so that all lengths become metres. Without --anchor, show what is known about the scale.
 
     Example: list3r scale house.l3r --anchor "12=0.095m"
     """
@@ -49,6 +44,6 @@ def scale(
         told = None if anchor is None else report.as_dict()
         print_answer([{"scale": kind, "scale_source": source, "edit": told}], units)
     elif kind == "relative":
-        say('scale relative: the length of a unit is unknown; --anchor "ID=0.095m" makes them metres')
+        say('scale relative: how long a unit is is unknown; --anchor "ID=0.095m" turns units into metres')
     else:
         say(f"scale {kind}: lengths are metres ({source})")

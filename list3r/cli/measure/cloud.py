@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CloudWords:
+class CloudArguments:
     """How clouds are placed, thinned and compared."""
 
     align: Annotated[
@@ -43,28 +43,28 @@ class CloudWords:
         typer.Option(
             "--align",
             metavar="TRAJECTORY|icp|none",
-            help="Place the estimate by the true path of its camera, by its surfaces, or (give both) by one after the"
-            " other. Absent: by the path where TRUTH is a source, else none.",
+            help="How to align the estimate: by its camera path, by its surfaces (ICP), or, given twice, by one after "
+            "the other. Default: by the path if TRUTH is a source, else none.",
         ),
     ] = None
     path: Annotated[
         Path | None,
-        typer.Option("--path", metavar="TRAJECTORY", help="The estimate's own camera path, where it is no memory."),
+        typer.Option("--path", metavar="TRAJECTORY", help="Camera path of the estimate, if it is not a memory."),
     ] = None
     scale: ScaleOption = "auto"
     threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05
     truncate: Annotated[
-        float | None, typer.Option("--truncate", help="Cap single distances, metres; absent: no cap.")
+        float | None, typer.Option("--truncate", help="Cap each distance at this, metres; default: no cap.")
     ] = None
-    voxel: Annotated[float, typer.Option("--voxel", help="Thin both clouds to one point a cell, metres; 0: not.")] = (
-        0.01
-    )
+    voxel: Annotated[
+        float, typer.Option("--voxel", help="Thin both clouds to one point per cell of this size, metres; 0: keep all.")
+    ] = 0.01
     points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000
     every: EveryOption = None
     plot: PlotOption = None
 
 
-def cloud(truth: Truth, estimate: Estimate, asked: CloudWords, json: JsonOption = False) -> None:
+def cloud(truth: Truth, estimate: Estimate, asked: CloudArguments, json: JsonOption = False) -> None:
     """Accuracy, completeness, Chamfer, normal consistency, F-score. TRUTH: a cloud or mesh, a memory, or a source with
     depth and poses; ESTIMATE: a cloud or a memory (all supports of its things and surfaces, in the world).
 
@@ -94,12 +94,12 @@ def cloud(truth: Truth, estimate: Estimate, asked: CloudWords, json: JsonOption 
         gaps = (distances.to_truth, distances.to_estimate)
         save_picture(_figure(found, true, gaps, 2 * asked.threshold, title, true_path), asked.plot)
     if json:
-        used = {"truth": true.words, "estimate": found.words, "alignment": how, "voxel_m": asked.voxel}
+        used = {"truth": true.text, "estimate": found.text, "alignment": how, "voxel_m": asked.voxel}
         counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
         print_answer([{**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)}])
         return
-    say(f"truth     {true.words}; {len(true.points):,} compared")
-    say(f"estimate  {found.words}; {len(found.points):,} compared")
+    say(f"truth     {true.text}; {len(true.points):,} compared")
+    say(f"estimate  {found.text}; {len(found.points):,} compared")
     say(f"aligned   {how}")
     _print_errors(errors)
 
@@ -132,7 +132,7 @@ def _figure(
 
 
 def _cloud_alignment(
-    asked: CloudWords, truth: tuple[PointCloud, Trajectory | None, Path], estimate: tuple[PointCloud, Path]
+    asked: CloudArguments, truth: tuple[PointCloud, Trajectory | None, Path], estimate: tuple[PointCloud, Path]
 ) -> tuple[Sim3, str]:
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register
@@ -155,7 +155,7 @@ def _cloud_alignment(
             said.append(f"{kind} by point-to-plane ICP")
             continue
         if not is_memory(estimate_path) and not estimate_path.suffix.lower() == ".txt":
-            raise OptionError(f"--align {word}: {estimate_path} knows no camera path; give its own with --path")
+            raise OptionError(f"--align {word}: {estimate_path} has no camera path; give one with --path")
         goal = true_path if by_source and true_path is not None else read_trajectory(Path(word))
         S = alignment_of(goal, read_trajectory(estimate_path), with_scale=free)
         said.append(f"{kind} by the camera's path")
@@ -177,4 +177,4 @@ def _check_lengths(**lengths: float | None) -> None:
 
     for name, value in lengths.items():
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise OptionError(f"--{name} {value:g}: a length above 0 in metres is needed")
+            raise OptionError(f"--{name} {value:g}: give a length above 0, metres")

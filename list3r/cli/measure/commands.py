@@ -34,19 +34,11 @@ if TYPE_CHECKING:
     from list3r.memory.geometry import Sim3
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    group = typer.Typer(help="Measure a result against truth.", no_args_is_help=True, rich_markup_mode=None)
-    for command in (trajectory, cloud, instances, revisits):
-        group.command(command.__name__)(spread(command))
-    app.add_typer(group, name="eval")
-
-
 # ---------------------------------------------------------------------------------------------- trajectory
 
 
 @dataclass(frozen=True)
-class TrajectoryWords:
+class TrajectoryArguments:
     """How poses are associated and placed."""
 
     delta: Annotated[
@@ -56,13 +48,15 @@ class TrajectoryWords:
     scale: Annotated[
         str,
         typer.Option(
-            "--scale", metavar="auto|free|fixed", help="Of the picture; auto: free for a memory of relative scale."
+            "--scale",
+            metavar="auto|free|fixed",
+            help="Alignment in the picture; auto: free for a memory of relative scale.",
         ),
     ] = "auto"
     plot: PlotOption = None
 
 
-def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryWords, json: JsonOption = False) -> None:
+def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryArguments, json: JsonOption = False) -> None:
     """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a TUM file, a memory, or a source with poses.
 
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
@@ -74,7 +68,7 @@ def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryWords, json: J
     check_scale(asked.scale)
     check_plot(asked.plot)
     if not tolerance >= 0:
-        raise OptionError(f"--tolerance {tolerance:g}: seconds, 0 or more, are needed")
+        raise OptionError(f"--tolerance {tolerance:g}: give 0 or more seconds")
     apart = Delta.parse(asked.delta)
     true, found = read_trajectory(truth), read_trajectory(estimate)
     errors = evaluate_trajectory(true, found, tolerance, delta=apart)
@@ -107,15 +101,15 @@ def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float
     S_truth_estimate = align(a, b, with_scale=free)
     errors = position_errors(a, b, S_truth_estimate)
     kind = f"Sim(3), scale {float(S_truth_estimate.scale):.4f}" if free else "SE(3)"
-    words = f"{title}\nATE {float((errors**2).mean() ** 0.5):.4f} m RMSE over {len(errors)} poses, {kind}"
-    return trajectory_figure(truth, b.time_s, S_truth_estimate.apply(b.positions()), errors, words)
+    title_text = f"{title}\nATE {float((errors**2).mean() ** 0.5):.4f} m RMSE over {len(errors)} poses, {kind}"
+    return trajectory_figure(truth, b.time_s, S_truth_estimate.apply(b.positions()), errors, title_text)
 
 
 # ---------------------------------------------------------------------------------------------- instances
 
 
 @dataclass(frozen=True)
-class InstanceWords:
+class InstanceArguments:
     """How a scene is placed, and where true ids lie."""
 
     align: Annotated[
@@ -123,7 +117,7 @@ class InstanceWords:
         typer.Option(
             "--align",
             metavar="TRAJECTORY|none",
-            help="True path of the camera, to place a memory by. Absent: groundtruth.txt beside TRUTH, if it is there.",
+            help="True camera path, by which a memory is aligned. Default: groundtruth.txt beside TRUTH, if present.",
         ),
     ] = None
     scale: ScaleOption = "auto"
@@ -132,14 +126,14 @@ class InstanceWords:
         typer.Option(
             "--ids",
             metavar="FOLDER",
-            help="Pictures of the true ids of every frame, for id switches of a memory. Absent: ids/ beside TRUTH.",
+            help="Folder of pictures of true ids, for id switches of a memory. Default: ids/ beside TRUTH.",
         ),
     ] = None
-    every: Annotated[int, typer.Option("--every", metavar="N", help="Follow ids over every N-th frame.")] = 1
+    every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1
     plot: PlotOption = None
 
 
-def instances(truth: Truth, estimate: Estimate, asked: InstanceWords, json: JsonOption = False) -> None:
+def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: JsonOption = False) -> None:
     """Recall, precision, duplicates, merges, id switches; relations. TRUTH: a truth.json; ESTIMATE: a memory or scene
     JSON.
 
@@ -150,7 +144,7 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceWords, json: Json
 
     align = asked.align
     if align not in (None, "none") and estimate.is_file() and not is_memory(estimate):
-        raise OptionError(f"--align {align} places a memory; {estimate} is none and knows no camera path")
+        raise OptionError(f"--align {align} aligns a memory; {estimate} is not one and has no camera path")
     check_scale(asked.scale)
     check_plot(asked.plot)
     check_every(asked.every)
@@ -190,7 +184,7 @@ def _identities(
 
     folder = ids or truth.parent / "ids"
     if ids is not None and not ids.is_dir():
-        raise OptionError(f"--ids {ids} is no folder; give the folder with one picture of true ids a frame")
+        raise OptionError(f"--ids {ids} is not a folder; give the folder with one picture of true ids per frame")
     if not is_memory(estimate):
         if ids is not None:
             raise OptionError(f"--ids: {estimate} has no masks; id switches are measured on a memory")
@@ -214,8 +208,8 @@ def _instances_figure(
     true_boxes = {k: (box, labels[k]) for k, box in scene_boxes(true).items() if k in counted}
     boxes = {k: (box, "") for k, box in scene_boxes(found, S_truth_scene).items()}
     loose = scores["instances_0.25"]
-    words = f"{title}: recall {loose['recall']:.2f}, precision {loose['precision']:.2f} at IoU 0.25"
-    return instances_figure(true_boxes, boxes, matches, words)
+    title_text = f"{title}: recall {loose['recall']:.2f}, precision {loose['precision']:.2f} at IoU 0.25"
+    return instances_figure(true_boxes, boxes, matches, title_text)
 
 
 def score_rows(scores: dict[str, Any]) -> list[list[object]]:
@@ -228,3 +222,8 @@ def score_rows(scores: dict[str, Any]) -> list[list[object]]:
     for name, entry in scores["relations"]["by_predicate"].items():
         rows.append([f"{name}, of matched things", share(entry["recall"]), share(entry["precision"]), ""])
     return rows
+
+
+measures = typer.Typer(help="Compare a result with ground truth.", no_args_is_help=True, rich_markup_mode=None)
+for command in (trajectory, cloud, instances, revisits):
+    measures.command(command.__name__)(spread(command))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from list3r.memory.geometry import Sim3
     from list3r.memory.store.store import Store
 
-_VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
+_SOURCES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".r3d", ".sens", ".bag", ".mcap", ".db3", ".vrs")
 
 
 def is_memory(path: Path) -> bool:
@@ -33,7 +33,7 @@ def is_memory(path: Path) -> bool:
 
 def is_source(path: Path) -> bool:
     """Whether a path is read as frames."""
-    return path.is_dir() or path.suffix.lower() in _VIDEOS
+    return path.is_dir() or path.suffix.lower() in _SOURCES
 
 
 def scale_of(path: Path) -> str:
@@ -87,12 +87,12 @@ def _given(path: Path) -> Trajectory:
     import numpy as np
 
     from list3r.evaluation.trajectory import Trajectory
-    from list3r.frames.folder import FolderSource
     from list3r.frames.source import open_source
     from list3r.memory.errors import OptionError
 
     source = open_source(path)
-    poses = source.read_poses() if isinstance(source, FolderSource) else []
+    read = getattr(source, "read_poses", None)
+    poses = [] if read is None else read()
     if not poses:
         raise OptionError(f"{path} has no poses; give a TUM trajectory file, a memory, or a source with poses")
     return Trajectory(np.array([time_s for _, time_s, _ in poses]), np.stack([T for _, _, T in poses]))
@@ -199,8 +199,8 @@ def _fused(path: Path, every: int | None) -> tuple[PointCloud, Trajectory]:
         cloud = PointCloud(local @ T[:3, :3].T + T[:3, 3], None)
         parts.append(thinned(cloud, 0.01).points if len(local) else cloud.points)
     points = np.concatenate(parts)
-    words = f"{len(points):,} points of the depth of {len(parts)} frames"
-    return PointCloud(points, None, words), Trajectory(frames.time_s, frames.T_source_cam)
+    text = f"{len(points):,} points of the depth of {len(parts)} frames"
+    return PointCloud(points, None, text), Trajectory(frames.time_s, frames.T_source_cam)
 
 
 def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
@@ -219,8 +219,8 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
     if not len(points):
         raise OptionError(f"{path} holds no surface point; finish its build with --resume")
     surfaces = sum(i.structure is not None for i in main.instances)
-    words = f"{len(points):,} points of {len(supports) - surfaces} things and {surfaces} surfaces"
-    return PointCloud(points, None, words), _stored(path)
+    text = f"{len(points):,} points of {len(supports) - surfaces} things and {surfaces} surfaces"
+    return PointCloud(points, None, text), _stored(path)
 
 
 # ---------------------------------------------------------------------------------------------- scenes

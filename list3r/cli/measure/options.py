@@ -28,7 +28,7 @@ ScaleOption = Annotated[
 ]
 EveryOption = Annotated[
     int | None,
-    typer.Option("--every", metavar="N", help="Read every N-th frame of a source; about 250 in all if absent."),
+    typer.Option("--every", metavar="N", help="Read every N-th frame of a source; default: about 250 in all."),
 ]
 
 
@@ -42,7 +42,7 @@ def check_scale(scale: str) -> None:
     from list3r.memory.errors import OptionError
 
     if scale not in ("auto", "free", "fixed"):
-        raise OptionError(f"--scale {scale}: choose auto, free or fixed")
+        raise OptionError(f"--scale {scale}: use auto, free or fixed")
 
 
 def check_every(every: int | None) -> None:
@@ -50,7 +50,7 @@ def check_every(every: int | None) -> None:
     from list3r.memory.errors import OptionError
 
     if every is not None and every < 1:
-        raise OptionError(f"--every {every}: take every n-th frame with n of at least 1")
+        raise OptionError(f"--every {every}: must be at least 1")
 
 
 def check_plot(plot: Path | None) -> None:

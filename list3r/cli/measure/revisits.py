@@ -28,21 +28,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RevisitWords:
+class RevisitArguments:
     """How loops are judged."""
 
     least: Annotated[
-        float, typer.Option("--least", help="Least share of the surface, seen in both frames, of a revisit.")
+        float,
+        typer.Option("--least", help="A revisit is a pair of frames that share at least this part of the surface."),
     ] = 0.3
     different: Annotated[
-        float, typer.Option("--different", help="Share below which frames see different places; between: not counted.")
+        float,
+        typer.Option(
+            "--different",
+            help="Frames that share less than this see different places; pairs between the two are not counted.",
+        ),
     ] = 0.1
     precision: Annotated[float, typer.Option("--precision", help="Precision at which rankings are compared.")] = 0.99
-    session: Annotated[int, typer.Option("--session", help="The session of the memory that TRUTH is of.")] = 1
+    session: Annotated[int, typer.Option("--session", help="The session of the memory that TRUTH belongs to.")] = 1
     every: EveryOption = None
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="FILE", help="Write the covisibility as .npz, to be TRUTH next time."),
+        typer.Option("--save", metavar="FILE", help="Write the covisibility as .npz, to use as TRUTH next time."),
     ] = None
     plot: PlotOption = None
 
@@ -50,7 +55,7 @@ class RevisitWords:
 def revisits(
     truth: Truth,
     memory: Annotated[Path, typer.Argument(metavar="MEMORY", show_default=False)],
-    asked: RevisitWords,
+    asked: RevisitArguments,
     json: JsonOption = False,
 ) -> None:
     """Precision and recall of loops against covisibility. TRUTH: the source with depth and poses, or an .npz of frame

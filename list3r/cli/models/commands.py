@@ -21,14 +21,8 @@ if TYPE_CHECKING:
 models = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="List the networks that can be used, with their licences and cached weights, and fetch weights.",
+    help="List the networks with their licences and cached weights, and download weights.",
 )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.add_typer(models, name="models")
-    app.command("precompute")(precompute)
 
 
 @models.command("list")
@@ -38,7 +32,7 @@ def list_models(
     ] = "any",
     json: JsonOption = False,
 ) -> None:
-    """Say of every model what it does, under which licences, whether its package and its weights are here.
+    """List every model: what it does, its licences, and whether its package and weights are on this machine.
 
     Example: list3r models list --licence permissive
     """
@@ -77,7 +71,7 @@ def fetch_model(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Bring the weights of a model into the cache, so that it runs without a network from then on.
+    """Download the weights of a model into the cache; from then on it runs offline.
 
     Example: list3r models fetch mapanything --licence permissive
     """
@@ -101,16 +95,16 @@ def precompute(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
     *,
     request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
-    words: src.SourceWords,
+    given: src.SourceArguments,
     run: Annotated[RunOptions, only("licence")],
-    force: Annotated[bool, typer.Option("--force", help="Write chunks anew that are there already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write chunks again that are there already.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Reconstruct a video into .npz files, which `build --reconstruction precomputed --weights DIR` reads elsewhere.
+    """Reconstruct a video into .npz files, for `build --reconstruction precomputed --weights DIR` on another machine.
 
     Example: list3r precompute walk.mp4 --out walk-pi3/ --reconstruction pi3
     """
-    options = words.options()
+    options = given.options()
     from list3r.pipeline.precompute import precompute as write
 
     def interrupted(begun: bool) -> str:
@@ -176,7 +170,7 @@ def _named(name: str, licence: str) -> Weights:
 
     parts = split_name(name)
     if parts is None:
-        raise OptionError(f"{name} is no repository; its name is owner/name or owner/name@revision")
+        raise OptionError(f"{name} is not the name of a repository; give owner/name or owner/name@revision")
     for card in CARDS:
         if (known := find_weights(card, parts[0])) is not None:
             choose_weights(card, name, licence, "model")

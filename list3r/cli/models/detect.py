@@ -15,17 +15,14 @@ from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("detect")(detect)
-
-
 @spread
 def detect(
     memory: MemoryArgument,
     detector: Annotated[
         Path,
-        typer.Option("--detector", metavar="FILE", help="A NanoDet detector for ncnn: .param, its .bin beside."),
+        typer.Option(
+            "--detector", metavar="FILE", help="A NanoDet detector for ncnn (.param, with its .bin beside it)."
+        ),
     ],
     *,
     run: Annotated[RunOptions, only("detector_classes")],
@@ -38,20 +35,20 @@ def detect(
             show_default=False,
         ),
     ] = None,
-    words: src.SourceWords,
+    given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
-    """Name the things of a memory: boxes of a detector vote over many frames. What an operator named keeps its name.
+    """Name the things of a memory by a box detector, whose boxes vote over many frames. Names by an operator stay.
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
     from list3r.memory.errors import OptionError
 
-    if source is None and words != src.SourceWords():
-        raise OptionError("options that say how a video is read, such as --every, need the video: --source SOURCE")
+    if source is None and given != src.SourceArguments():
+        raise OptionError("options of a video, such as --every, need the video: --source SOURCE")
     from list3r.pipeline.finishing import load_detector, name_things
 
-    network, options = load_detector(detector, run.detector_classes), words.options()
+    network, options = load_detector(detector, run.detector_classes), given.options()
     with progress_bar("detecting", "chunks", quiet=json) as bar:
         report = name_things(memory, network, source, options, bar.show)
     if json:

@@ -13,16 +13,11 @@ from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("embed")(embed)
-
-
 @spread
 def embed(
     memory: MemoryArgument,
     *,
-    model: Annotated[str, typer.Option("--model", metavar="siglip2|clip", help="Which model.")] = "siglip2",
+    model: Annotated[str, typer.Option("--model", metavar="siglip2|clip", help="The text-image model.")] = "siglip2",
     weights: Annotated[
         str | None,
         typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
@@ -31,7 +26,7 @@ def embed(
     run: Annotated[RunOptions, only("licence")],
     json: JsonOption = False,
 ) -> None:
-    """Look at the stored pictures of every thing with a text and image model; then free words find things.
+    """Describe every thing by a text-image model, so that free words find it.
 
     Example: list3r embed house.l3r --model siglip2
     """
@@ -44,4 +39,4 @@ def embed(
         return
     say(f"{report.instances} things have a vector in {report.space}")
     if report.without_picture:
-        say(f"{report.without_picture} are shown by no stored picture")
+        say(f"{report.without_picture} are in no stored picture")

@@ -21,33 +21,29 @@ _CONNECTIONS = 4
 """To the database of a catalogue, at most."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the program."""
-    app.command("mcp")(mcp)
-    app.command("ask-config")(ask_config)
-
-
 def mcp(
     memory: Annotated[Path | None, typer.Argument(metavar="[MEMORY]", help="The memory file.")] = None,
     catalog: Annotated[
         str | None,
-        typer.Option("--catalog", metavar="URL", help="A catalogue instead: postgresql://host/name, or a file."),
+        typer.Option("--catalog", metavar="URL", help="Serve a catalogue instead: postgresql://host/name, or a file."),
     ] = None,
     http: Annotated[bool, typer.Option("--http", help="Streamable HTTP on this machine instead of stdio.")] = False,
     port: Annotated[int, typer.Option("--port", help="Port of --http; 0: any free one.")] = 8740,
-    write: Annotated[bool, typer.Option("--write", help="Also tools that edit; keeps other writers out.")] = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="Also offer tools that edit; no other program can write meanwhile.")
+    ] = False,
 ) -> None:
-    """Serve a memory, or with --catalog many, to agents by the Model Context Protocol. With --http clients must send a
-    token: that of the environment variable LIST3R_MCP_TOKEN, else a new one, which is printed.
+    """Serve a memory, or a catalogue, to agents by the Model Context Protocol (MCP). With --http clients must send a
+    token: the value of the environment variable LIST3R_MCP_TOKEN, or else a new one, which is printed.
 
     Example: list3r mcp house.l3r --http
     """
     from list3r.memory.errors import OptionError
 
     if (memory is None) == (catalog is None):
-        raise OptionError("mcp serves one of two: a memory, or --catalog URL; list3r mcp house.l3r")
+        raise OptionError("give a memory or --catalog URL, one of the two: list3r mcp house.l3r")
     if catalog is not None and write:
-        raise OptionError("--write edits one memory; a catalogue is only asked")
+        raise OptionError("--write needs a memory; a catalogue cannot be edited")
     from list3r.server.app import HttpSettings, serve_http, serve_stdio
 
     with _opened(memory, catalog, write=write) as served:
@@ -82,10 +78,10 @@ def ask_config(
     client: Annotated[
         str, typer.Option("--client", metavar="NAME", help="claude, cursor, gemini, vscode or codex.")
     ] = "claude",
-    write: Annotated[bool, typer.Option("--write", help="With tools that edit.")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Offer tools that edit.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Print the entry with which a program starts the server of a memory.
+    """Print the configuration entry by which an agent's program starts the MCP server of a memory.
 
     Example: list3r ask-config house.l3r --client vscode
     """

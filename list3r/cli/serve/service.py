@@ -16,23 +16,21 @@ SECRET_VARIABLE = "LIST3R_SERVE_SECRET"
 _FIRST_TOKEN_HOURS = 24.0
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("serve")(serve)
-
-
 def serve(
     catalog: CatalogOption = "catalog.sqlite",
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", help="0: any free one.")] = 8750,
-    workers: Annotated[int, typer.Option("--workers", metavar="N", help="Processes.")] = 1,
-    timeout: Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="For one request.")] = 10.0,
+    port: Annotated[int, typer.Option("--port", help="Port to listen on; 0: any free one.")] = 8750,
+    workers: Annotated[int, typer.Option("--workers", metavar="N", help="Worker processes.")] = 1,
+    timeout: Annotated[
+        float, typer.Option("--timeout", metavar="SECONDS", help="Time allowed for one request.")
+    ] = 10.0,
     hours: Annotated[
-        float | None, typer.Option("--token-for", metavar="HOURS", help="Print a token that holds so long, and stop.")
+        float | None,
+        typer.Option("--token-for", metavar="HOURS", help="Print a token that is valid for this long, and exit."),
     ] = None,
 ) -> None:
-    """Serve a catalogue over HTTP. Clients send a token made with --token-for and the secret in LIST3R_SERVE_SECRET;
-    without a secret a new one is made, and a token for a day is printed.
+    """Serve a catalogue over HTTP. Clients send a token that --token-for made with the secret in LIST3R_SERVE_SECRET.
+    Without a secret the service makes one and prints a token for a day.
 
     Example: list3r serve --catalog postgresql://db.example/list3r --workers 4
     """

@@ -11,17 +11,12 @@ import typer
 from list3r.cli.common import note
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the program."""
-    app.command("view")(view)
-
-
 def view(
     memories: Annotated[
-        list[Path], typer.Argument(metavar="MEMORY...", help="The memory file; several stand side by side.")
+        list[Path], typer.Argument(metavar="MEMORY...", help="The memory file; several are shown side by side.")
     ],
     port: Annotated[int, typer.Option("--port", help="Port on this machine; the next free one if taken.")] = 8741,
-    write: Annotated[bool, typer.Option("--write", help="Also edits; keeps other writers out.")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Allow edits; no other program can write meanwhile.")] = False,
     browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
 ) -> None:
     """Show a memory in the browser: points, boxes, names, the camera's path; click, search, measure, go back in time.
@@ -45,7 +40,7 @@ def view(
             beside = SideBySide([(v.memory.path.name, v.address) for v in viewers])
             stack.callback(beside.stop)
             address = beside.address
-        note(f"{address}  (Ctrl-C ends it)")
+        note(f"{address}  (Ctrl-C stops it)")
         if browser:
             import webbrowser
 

@@ -39,15 +39,6 @@ class ClosedSurface:
         return np.where(length > 0, out / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0])
 
 
-def is_closed(surface: ClosedSurface) -> bool:
-    """Tell whether each edge has one face on either side, which run through it in opposite directions."""
-    edges = np.concatenate([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    if not len(edges) or len(np.unique(edges, axis=0)) != len(edges):
-        return False
-    key = edges[:, 0] * len(surface.vertices) + edges[:, 1]
-    return bool(np.isin(edges[:, 1] * len(surface.vertices) + edges[:, 0], key).all())
-
-
 # ---------------------------------------------------------------------------------------------- fields
 
 _TETRAHEDRA = tuple((0, 1 << a, (1 << a) | (1 << b), 7) for a, b in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)))

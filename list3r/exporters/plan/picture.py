@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from list3r.exporters.components import Component, has_box, read_components, thinned_support
-from list3r.exporters.output import part_path, replacing, units
+from list3r.exporters.components import Component, component_files, has_box, thinned_support
+from list3r.exporters.output import units, write_together
 from list3r.exporters.plan.colors import plan_colors
 from list3r.exporters.plan.drawing import (
     draw_boxes,
@@ -31,20 +30,17 @@ from list3r.memory.store.store import Store
 
 def write_plan(store: Store, path: str | Path, settings: PlanSettings | None = None) -> tuple[Path, ...]:
     """Write the plan view of every component as PNG or SVG, the main one to `path`. Returns the files written."""
-    path, settings = Path(path), settings or PlanSettings()
-    written = []
-    with contextlib.ExitStack() as stack:
-        for component in read_components(store):
-            target = part_path(path, component.name)
-            temporary = stack.enter_context(replacing(target))
-            if path.suffix.lower() == ".svg":
-                sheet = _drawn(store, component, settings, vector=True)
-                assert sheet.vector is not None
-                temporary.write_text(sheet.vector.svg(settings.width_px), encoding="utf-8")
-            else:
-                plan_image(store, component, settings).save(temporary, format="PNG")
-            written.append(target)
-    return tuple(written)
+    chosen, vector = settings or PlanSettings(), Path(path).suffix.lower() == ".svg"
+
+    def write(component: Component, to: Path) -> None:
+        if vector:
+            sheet = _drawn(store, component, chosen, vector=True)
+            assert sheet.vector is not None
+            to.write_text(sheet.vector.svg(chosen.width_px), encoding="utf-8")
+        else:
+            plan_image(store, component, chosen).save(to, format="PNG")
+
+    return write_together(component_files(store, path), write)
 
 
 def plan_image(store: Store, component: Component, settings: PlanSettings | None = None) -> Image.Image:

@@ -41,9 +41,9 @@ class SimreadySettings:
 
     def __post_init__(self) -> None:
         if self.density is not None and not 0 < self.density < 1e6:
-            raise OptionError(f"density {self.density:g}: kilograms per cubic metre above 0 are needed, such as 300")
+            raise OptionError(f"density {self.density:g}: give kilograms per cubic metre, such as 300")
         if self.workers is not None and self.workers < 0:
-            raise OptionError(f"workers {self.workers}: a number of processes is needed, 0 for none beside this one")
+            raise OptionError(f"workers {self.workers}: give the number of worker processes, 0 for none")
 
 
 def write_simready(store: Store, folder: str | Path, settings: SimreadySettings | None = None) -> tuple[Path, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame, FrameSource
+from list3r.frames.decoding.picture import gray_of
 
 Floats = NDArray[np.float32]
 Gray = NDArray[np.uint8]
@@ -163,11 +164,7 @@ def _thumbnails(source: FrameSource, count: int) -> Iterator[Gray | None]:
     elif read_gray is not None:
         yield from (_small(read_gray(k, 8)) for k in range(count))
     else:
-        yield from (_small(_grey(f)) if isinstance(f, Frame) else None for f in source.read(0, count))
-
-
-def _grey(frame: Frame) -> Gray:
-    return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
+        yield from (_small(gray_of(f)) if isinstance(f, Frame) else None for f in source.read(0, count))
 
 
 def _small(gray: Gray | None) -> Gray | None:
@@ -276,4 +273,4 @@ class _Looks:
         read_grays = getattr(self._source, "read_grays", None)
         if read_grays is not None:
             return iter(read_grays(first, stop))
-        return (_grey(f) if isinstance(f, Frame) else None for f in self._source.read(first, stop))
+        return (gray_of(f) if isinstance(f, Frame) else None for f in self._source.read(first, stop))

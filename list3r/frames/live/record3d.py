@@ -19,10 +19,12 @@ import numpy as np
 from list3r.frames.live.camera import LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.usbmux import connect, receive
-from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS, VARIES
+from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS
 from list3r.memory.errors import OptionError, SourceError
 
 PORT = 1337
+_VARIES = 0.01
+"""Focal lengths that differ by a larger share are told of."""
 _OUTER = struct.Struct(">4I")
 _HEADER = struct.Struct("<11I")
 _FLOATS = struct.Struct("<11f")
@@ -82,7 +84,7 @@ class Record3dPhone:
                     continue
                 if again:
                     self._say("the phone's poses after a lost connection are of another world and are left out")
-                if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > VARIES:
+                if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > _VARIES:
                     self._say("the focal length changes by more than 1 %: one camera serves all pictures")
                 pose = () if again else frame.pose
                 yield LivePicture(frame.files.copy, " ".join(f"{v:.9g}" for v in pose))
@@ -110,7 +112,7 @@ def _message(phone: socket.socket) -> bytearray:
     while length == 0:
         length = _OUTER.unpack(receive(phone, _OUTER.size))[3]
     if length > _MOST_BYTES:
-        raise LostError(f"what came is no frame of Record3D: {length} bytes")
+        raise LostError(f"what came is not a frame of Record3D: {length} bytes")
     return receive(phone, length)
 
 
@@ -118,14 +120,14 @@ def _parsed(body: bytearray) -> _PhoneFrame:
     """Return what a message says. Raises `LostError` where it is no frame, `SourceError` for the front camera."""
     start = _HEADER.size + _FLOATS.size
     if len(body) < start:
-        raise LostError("what came is no frame of Record3D 1.10 or newer")
+        raise LostError("what came is not a frame of Record3D 1.10 or newer")
     *sizes, jpeg, depth, confidence, misc, kind = _HEADER.unpack_from(body)
     numbers = _FLOATS.unpack_from(body, _HEADER.size)
     pixels = [sizes[k] * sizes[k + 1] for k in (0, 2, 4)]
     fits = start + jpeg + depth + confidence + misc == len(body) and jpeg > 0
     fits = fits and pixels[0] > 0 and 0 < pixels[1] <= MOST_DEPTH_PIXELS and pixels[2] <= MOST_DEPTH_PIXELS
     if not (fits and np.isfinite(numbers[:4]).all() and min(numbers[:2]) > 0):
-        raise LostError("what came is no frame of Record3D 1.10 or newer")
+        raise LostError("what came is not a frame of Record3D 1.10 or newer")
     if kind == _FRONT_CAMERA:
         raise SourceError("the phone streams its front camera, which knows no poses: choose LiDAR in Record3D")
     files, at = {}, start

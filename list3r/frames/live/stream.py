@@ -15,13 +15,16 @@ from list3r.frames.live.camera import LiveCamera, LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.record3d import Record3dPhone
 from list3r.frames.writers.pictures import jpeg
-from list3r.memory.errors import SourceError
+from list3r.memory.errors import OptionError, SourceError
 
 
 def open_camera(source: str, tell: Tell) -> LiveCamera:
     """Return what the pictures of a stream come from; nothing is connected yet. Raises `OptionError`."""
     if is_phone(source):
         return Record3dPhone(source.partition(":")[2].strip("/"), tell)
+    if source.startswith(DEVICES) and not Path(source).exists():
+        others = ", ".join(str(p) for p in sorted(Path(DEVICES).parent.glob(f"{Path(DEVICES).name}*")))
+        raise OptionError(f"there is no webcam {source}; there is {others or 'none at all'}")
     return NetworkStream(source)
 
 

@@ -184,7 +184,7 @@ def _opened(path: Path, stream: str) -> Any:
     except RuntimeError as error:
         raise SourceError(f"{path} cannot be read ({str(error).splitlines()[0]}); copy it again") from None
     if provider is None:
-        raise SourceError(f"{path} is no recording in VRS that can be read; was the copy finished?")
+        raise SourceError(f"{path} is not a recording in VRS that can be read; was the copy finished?")
     streams = [str(s) for s in provider.get_all_streams()]
     if stream not in streams or not provider.get_num_data(StreamId(stream)):
         raise SourceError(f"{path} has no pictures in the stream {stream}, but {', '.join(streams) or 'none'}")

@@ -58,6 +58,9 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     ]
     if rigged:
         notes.append(f"{len(rigged)} cameras of rigs, one after the other, each where its rig holds it")
+    others = sorted(p.name for p in model.parent.iterdir() if p != model and _is_model(p)) if model.name == "0" else []
+    if others:
+        notes.append(f"the model poses {len(posed)} pictures; not read: the models {', '.join(others)} beside it")
     if len(cameras) > 1:
         notes.append(f"the model has {len(cameras)} cameras; every picture is carried to their median")
     size = (shared.height, shared.width)
@@ -94,11 +97,11 @@ def _read(model: Path) -> tuple[Any, dict[str, NDArray[np.float64]]]:
         said = str(error).splitlines()[0]
         if "optional" in said:
             said = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
-        raise SourceError(f"{model} is no model of COLMAP that can be read ({said})") from None
+        raise SourceError(f"{model} is not a model of COLMAP that can be read ({said})") from None
     poses = {name: pose_matrix(rows.ravel().tolist()) for name, rows in stated.items()}
     wrong = [name for name, T in poses.items() if T is None]
     if wrong:
-        raise SourceError(f"{model}: the pose of {wrong[0]} is no rigid motion; copy the model again")
+        raise SourceError(f"{model}: the pose of {wrong[0]} is not a rigid motion; copy the model again")
     for name, size in written_sizes(found).items():
         if (model / name).is_file() and (model / name).stat().st_size != size:
             raise SourceError(apart)

@@ -14,8 +14,18 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.base import Camera
-from list3r.frames.layout import FolderLayout, Optics, inside, natural_key, pose_matrix, read_json
-from list3r.frames.listing import FrameFile, FrameFiles
+from list3r.frames.layout import (
+    IMAGE_ENDINGS,
+    VARIES,
+    FolderLayout,
+    Optics,
+    inside,
+    natural_key,
+    pose_matrix,
+    read_json,
+    varies_note,
+)
+from list3r.frames.listing import POSE, FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
 from list3r.memory.errors import OptionError, SourceError
@@ -24,8 +34,6 @@ _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "")
 _FISHEYE = "OPENCV_FISHEYE"
 _LENS = {False: ("k1", "k2", "p1", "p2", "k3"), True: ("k1", "k2", "k3", "k4")}
 """Names of the lens's numbers, of a pinhole camera and of a fisheye."""
-_VARIES = 0.01
-"""Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:
@@ -41,20 +49,28 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     model = str(rows[0].get("camera_model", content.get("camera_model", ""))).upper()
     if model not in (*_PINHOLE, _FISHEYE):
         raise SourceError(f"{path} states a {model} camera; undistort the pictures first, for instance with COLMAP")
-    files = FrameFiles(_file(root, path, row) for row in rows)
+    turned = _written_by_columns(rows)
+    files = FrameFiles(_file(root, path, row, turned) for row in rows)
+    if rows and not len(files.that_hold(POSE)) and any("transform_matrix" in row for row in rows):
+        raise SourceError(
+            f"{path}: the transform_matrix of no frame is a rigid motion (4x4, row by row); mend it, or say --kind "
+            "images to take colour alone"
+        )
     fisheye = model == _FISHEYE and options.distortion is None
     intrinsics, distortion, size, spread = _camera(path, content, rows, options, _LENS[fisheye])
-    notes = ["poses and cameras of transforms.json"]
-    if spread > _VARIES:
-        carried = options.intrinsics is None and not any(f.depth for f in files)
-        what = "every picture is carried to their median" if carried else "their median serves all of them"
-        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: {what}")
+    notes = ["poses and cameras of transforms.json" + (", matrices column by column" if turned else "")]
+    if spread > VARIES:
+        straight = not any(f.depth for f in files) or not (distortion or fisheye)
+        carried = options.intrinsics is None and straight
+        notes.append(varies_note(spread, carried))
         if carried:
             files, distortion, fisheye = FrameFiles(_with_lenses(files, content, rows, fisheye)), (), False
+    if left := _not_named(files):
+        notes.append(f"{left} pictures beside those of transforms.json are not named in it and not read")
     units = _units_per_metre(path, content)
     optics = Optics(intrinsics, distortion, depth_scale=units, intrinsics_size=size, fisheye=fisheye)
     if intrinsics is not None and not distortion and not fisheye:  # depth of another size has the same camera
-        optics = Optics(intrinsics, (), intrinsics, np.eye(4), units, size, size)
+        optics = Optics(intrinsics, depth_scale=units, intrinsics_size=size, shares_view=True)
     return FolderLayout(
         "nerfstudio",
         files,
@@ -85,23 +101,39 @@ def _metric(content: Mapping[str, Any], files: Sequence[FrameFile]) -> bool:
 def _units_per_metre(path: Path, content: Mapping[str, Any]) -> float:
     unit_m = content.get("depth_unit_scale_factor", 0.001)
     if not isinstance(unit_m, int | float) or not unit_m > 0:
-        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is no positive number of metres; mend it")
+        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is not a positive number of metres; mend it")
     return 1.0 / unit_m
 
 
-def _file(root: Path, path: Path, row: Mapping[str, Any]) -> FrameFile:
+def _written_by_columns(rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether the matrices have their translations in the last row."""
+    found = [_numbers(row.get("transform_matrix")) for row in rows]
+    whole = [v for v in found if len(v) == 16 and np.isfinite(v).all()]
+    return all(v[3] == v[7] == v[11] == 0 and v[15] == 1 for v in whole) and any(any(v[12:15]) for v in whole)
+
+
+def _file(root: Path, path: Path, row: Mapping[str, Any], turned: bool) -> FrameFile:
     """The files of a frame. Raises `SourceError` for names that lead out of the folder."""
     color = inside(root, row["file_path"], path)
     if not color.suffix:
         color = next((c for c in (color.with_suffix(s) for s in (".png", ".jpg", ".jpeg")) if c.is_file()), color)
     depth, mask = (row.get(name) for name in ("depth_file_path", "mask_path"))
-    T_world_opengl = pose_matrix(_numbers(row.get("transform_matrix")))
+    matrix = _numbers(row.get("transform_matrix"))
+    T_world_opengl = pose_matrix(np.reshape(matrix, (4, 4)).T.ravel() if turned and len(matrix) == 16 else matrix)
     return FrameFile(
         color,
         inside(root, depth, path) if isinstance(depth, str) and depth else None,
         T_source_camera=None if T_world_opengl is None else T_world_opengl @ OPENGL_TO_OPENCV,
         mask=inside(root, mask, path) if isinstance(mask, str) and mask else None,
     )
+
+
+def _not_named(files: Iterable[FrameFile]) -> int:
+    """Return how many pictures lie beside those of the frames."""
+    named = {file.color for file in files if isinstance(file.color, Path)}
+    there = {p for folder in {p.parent for p in named} if folder.is_dir() for p in folder.iterdir()}
+    other = {file.mask for file in files} | {file.depth for file in files}
+    return sum(p.suffix.lower() in IMAGE_ENDINGS for p in there - named - other)
 
 
 def _numbers(matrix: object) -> list[float]:

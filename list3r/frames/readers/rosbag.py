@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo, missing_parts
 from list3r.frames.files import check_ordinary
-from list3r.frames.folder import fingerprint
+from list3r.frames.folder import fingerprint, without_pose
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -26,7 +26,7 @@ from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.bag_chunks import bound_rosbags
 from list3r.frames.recordings.bag_mending import MendedFile, mended
 from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
-from list3r.frames.recordings.ros_transforms import TransformTree
+from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
 from list3r.frames.selection import select
 from list3r.memory.errors import FrameError, OptionError, SourceError
@@ -122,11 +122,16 @@ class BagSource:
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
         posed = sum(T is not None for T in self._poses)
         notes = [*notes, *said, *_cut_off(path), *unread]
+        if len(pairs) < len(color.times_s):
+            left = len(color.times_s) - len(pairs)
+            notes.append(f"{left} of {len(color.times_s)} pictures have no depth within 20 ms and are left out")
         if posed:
             notes.append(f"poses of {color.frame} in {world}")
+            if posed < len(pairs):
+                notes.append(without_pose(len(pairs) - posed, len(pairs)))
         elif tree.moving:
             notes.append(f"poses of {', '.join(sorted(tree.moving))}; no transform leads from there to {color.frame}")
-        self._info = self._describe(tuple(notes), posed > 0)
+        self._info = replace(self._describe(tuple(notes), posed > 0), poses_drift=world == DRIFTING)
 
     @property
     def info(self) -> SourceInfo:
@@ -328,7 +333,7 @@ class _Topics:
         if role in self._wanted:
             topic = self._wanted[role]
             if topic not in self._streams:
-                raise OptionError(f"--topics {role}={topic} is no topic of pictures")
+                raise OptionError(f"--topics {role}={topic} is not a topic of pictures")
             return self._streams[topic]
         for word in (*likely, ""):
             fitting = [s for s in found if word in s.topic]

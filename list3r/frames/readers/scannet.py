@@ -50,7 +50,7 @@ def find_file(path: Path, options: SourceOptions) -> FolderLayout:
         (version,) = struct.unpack("<I", _exactly(file, 4, path))
         (length,) = struct.unpack("<Q", _exactly(file, 8, path))
         if version != _VERSION or length > _LONGEST_NAME:
-            raise SourceError(f"{path} is no .sens file of version 4; unpack the scene with ScanNet's reader")
+            raise SourceError(f"{path} is not a .sens file of version 4; unpack the scene with ScanNet's reader")
         _exactly(file, length, path)
         color_k, color_e, depth_k, depth_e = (_matrix(file, path) for _ in range(4))
         codec, depth_codec, width, height, depth_width, depth_height, units, count = _SIZES.unpack(
@@ -89,7 +89,8 @@ def _frames(file: BinaryIO, path: Path, count: int, size: tuple[int, int]) -> tu
         color = FileSlice(path, start, color_bytes, f"frame-{number:06d}.jpg")
         depth = FileSlice(path, start + color_bytes, depth_bytes, f"frame-{number:06d}.depth")
         packed = CodedArray(depth, "zlib", "<u2", size)
-        files.append(FrameFile(color, packed, T_source_camera=pose_matrix(pose), time_s=1e-6 * color_us or None))
+        time_s = 1e-6 * color_us if color_us or not number else None  # a clock may begin at 0; no clock is all 0
+        files.append(FrameFile(color, packed, T_source_camera=pose_matrix(pose), time_s=time_s))
         file.seek(color_bytes + depth_bytes, 1)
     return files, len(files) == count
 
@@ -112,7 +113,7 @@ def _intrinsics(matrix: NDArray[np.float64]) -> Intrinsics:
 def _matrix_file(path: Path) -> Intrinsics:
     rows = read_numbers(path) if path.is_file() else []
     if len(rows) < 2 or min(len(rows[0]), len(rows[1])) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
-        raise SourceError(f"{path} is no camera matrix; mend it, or give --intrinsics and --depth-intrinsics")
+        raise SourceError(f"{path} is not a camera matrix; mend it, or give --intrinsics and --depth-intrinsics")
     return rows[0][0], rows[1][1], rows[0][2], rows[1][2]
 
 

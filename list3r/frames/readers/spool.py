@@ -28,7 +28,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         return FolderLayout("live", FrameFiles(_files(root, path)), Optics(options.intrinsics))
     content = read_json(root / METADATA)
     if not isinstance(content, dict):
-        raise SourceError(f"{root / METADATA} is no table; what was kept of the stream is damaged")
+        raise SourceError(f"{root / METADATA} is not a table; what was kept of the stream is damaged")
     camera, sure = PhoneCamera.of(root, content), content.get("confidence") is True
     first = next((file.T_source_camera for file in _files(root, path, camera, sure)), None)
     files = _files(root, path, camera, sure)

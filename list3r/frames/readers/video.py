@@ -30,11 +30,14 @@ _EARLIER = 4
 class VideoSource:
     """A `FrameSource` over one video stream. Every `read` opens the file anew and seeks to its first frame."""
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
-        """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`."""
+    def __init__(self, path: Path, options: SourceOptions, *, said: bool = True) -> None:
+        """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`.
+
+        `said`: the intrinsics of the options are the user's word, not that of a file beside the video.
+        """
         if options.depth_intrinsics or options.T_color_depth:
             raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
-        self._path, self._options = path, options
+        self._path, self._options, self._said = path, options, said
         self._stamps = list_stamps(path)
         self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
         count = len(self._stamps)
@@ -159,7 +162,7 @@ class VideoSource:
         return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
 
     def _first(self) -> tuple[Upright, Rig]:
-        optics = Optics(self._options.intrinsics, self._options.distortion or ())
+        optics = Optics(self._options.intrinsics, self._options.distortion or (), said=self._said)
         for _, image in self._decode(int(self._chosen.starts[0])):
             turned = Upright.of(image, self._stamps.aspect)
             return turned, build_rig(optics, turned.size, None, None, self._options.max_side)

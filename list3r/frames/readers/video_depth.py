@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
-from list3r.frames.folder import NOWHERE_SURE
+from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
 from list3r.frames.layout import Optics
 from list3r.frames.leftovers import not_read
 from list3r.frames.options import Intrinsics, SourceOptions
@@ -43,6 +44,8 @@ class RecordingParts:
     confidence: Callable[[int], Path] | None = None
     """The file of a frame's confidence, which need not exist."""
     least_confidence: int = 0
+    lenses: Mapping[int, Intrinsics] = field(default_factory=dict)
+    """Frames' own cameras, of the pictures as stored, where they differ from `intrinsics`."""
 
 
 class VideoWithDepth:
@@ -52,11 +55,12 @@ class VideoWithDepth:
         """Raises `SourceError` and `OptionError` where the files do not fit together."""
         side = WORKING_SIDES[True] if options.max_side is None else options.max_side
         words = replace(options, kind="auto", intrinsics=parts.intrinsics, max_side=side, depth_scale=None)
-        self._video, self._parts = VideoSource(parts.video, words), parts
+        said = options.intrinsics is not None
+        self._video, self._parts = VideoSource(parts.video, words, said=said), parts
         stored = self._video.stored_size
         scale = options.depth_scale or parts.units_per_m
         lens = options.distortion or ()
-        optics = Optics(parts.intrinsics, lens, parts.intrinsics, np.eye(4), scale, stored, stored)
+        optics = Optics(parts.intrinsics, lens, depth_scale=scale, intrinsics_size=stored, shares_view=True, said=said)
         size = read_raw_depth(next(iter(parts.depth.values()))).shape if parts.depth else None
         self._rig = build_rig(optics, stored, (size[0], size[1]) if size else None, options.max_depth_m, side)
         self._info = self._describe(root)
@@ -89,12 +93,16 @@ class VideoWithDepth:
         return [(k, time_s, T) for k, time_s, T in found if T is not None]
 
     def _with_depth(self, frame: Frame) -> Frame:
-        depth = None
+        depth, lens, color = None, None, frame.color
+        if frame.index in self._parts.lenses:
+            height, width = self._rig.stored_size
+            lens = Camera(width, height, *self._parts.lenses[frame.index]).resized(*color.shape[:2])
+            color = self._rig.color(color, lens)
         if self._parts.depth:
             if frame.index not in self._parts.depth:
                 raise FrameError(f"frame {frame.index} has no depth image")
-            depth = self._rig.depth(self._sure(frame.index))
-        return replace(frame, depth=depth, T_source_cam=self._parts.poses.get(frame.index))
+            depth = self._rig.depth(self._sure(frame.index), lens)
+        return replace(frame, color=color, depth=depth, T_source_cam=self._parts.poses.get(frame.index))
 
     def _sure(self, number: int) -> NDArray[np.generic]:
         raw = read_raw_depth(self._parts.depth[number])
@@ -103,7 +111,7 @@ class VideoWithDepth:
             return raw
         confidence = read_raw_depth(path)
         if confidence.shape != raw.shape:
-            raise FrameError(f"{path.name}: confidence and depth are of different sizes")
+            confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         return sure_depth(raw, confidence, self._parts.least_confidence)
 
     def _doubts(self) -> tuple[str, ...]:
@@ -111,8 +119,18 @@ class VideoWithDepth:
         numbers = sorted(self._parts.depth)
         some = numbers[:: max(1, len(numbers) // _FRAMES_TRIED)]
         with contextlib.suppress(FrameError):
-            return () if not some or any(self._sure(k).any() for k in some) else (NOWHERE_SURE,)
-        return ()
+            sure = not some or any(self._sure(k).any() for k in some)
+            return (*self._count_doubts(), *(() if sure else (NOWHERE_SURE,)))
+        return self._count_doubts()
+
+    def _count_doubts(self) -> tuple[str, ...]:
+        """Return how many frames of the video lack a pose or a depth image that others have."""
+        total, parts = self._video.stored_count, self._parts
+        posed, deep = (sum(k < total for k in found) for found in (parts.poses, parts.depth))
+        return (
+            *((without_pose(total - posed, total),) if 0 < posed < total else ()),
+            *((without_depth(total - deep, total),) if 0 < deep < total else ()),
+        )
 
     def _some_files(self) -> list[Stored | CodedArray | None]:
         """Return the video, and depth and confidence of the first frame."""
@@ -136,6 +154,7 @@ class VideoWithDepth:
                 *info.notes,
                 parts.note,
                 *self._doubts(),
+                *((NOT_STANDING,) if parts.z_up and parts.poses and turns is None else ()),
                 *lying_note(turns or 0),
                 *not_read(root, parts.kind, self._some_files()),
             ),

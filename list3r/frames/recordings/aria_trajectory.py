@@ -51,7 +51,7 @@ def read_trajectory(path: Path, times_s: NDArray[np.float64]) -> DeviceTrajector
         wanted = [f"t{a}_{world}_device" for a in "xyz"] + [f"q{a}_{world}_device" for a in "xyzw"]
         gravity = [f"gravity_{a}_{world}" for a in "xyz"]
         if "tracking_timestamp_us" not in names or not set(wanted) <= set(names):
-            raise SourceError(f"{path} is no trajectory of Aria (tracking_timestamp_us, tx_world_device, ...)")
+            raise SourceError(f"{path} is not a trajectory of Aria (tracking_timestamp_us, tx_world_device, ...)")
         columns = [names.index(n) for n in ("tracking_timestamp_us", *wanted, *(g for g in gravity if g in names))]
         graph = names.index("graph_uid") if "graph_uid" in names else None
         for uid, row in _beside(_rows(file, columns, graph, path), times_s):
@@ -78,7 +78,7 @@ def _rows(file: Iterator[str], columns: list[int], graph: int | None, path: Path
         try:
             values = [float(words[k]) for k in columns]
         except (ValueError, IndexError):
-            raise SourceError(f"{path}: line {number} is no row of a trajectory; was the copy finished?") from None
+            raise SourceError(f"{path}: line {number} is not a row of a trajectory; was the copy finished?") from None
         values[0] *= 1e-6
         if pose_of_quaternion(values[1:4], values[4:8]) is None or not np.isfinite(values).all():
             continue

@@ -56,11 +56,11 @@ def turns_in_gravity(T_world_cam: Sequence[Array]) -> int | None:
     """Return the quarter turns of `quarter_turns` where z can be up: the pictures stand on one of their sides.
 
     None where they stand on none of them on average, or there are no poses: then z of the poses' world is not up. Nor
-    is it where pictures would lie on their side, but stand upright by y and more plainly so.
+    is it where pictures would not stand upright, but do so by y and more plainly.
     """
     up = _mean_up(T_world_cam)
     turns = int(np.argmax(up))
-    by_y = abs(float(np.mean([T[1, 1] for T in T_world_cam]))) if turns % 2 else 0.0
+    by_y = abs(float(np.mean([T[1, 1] for T in T_world_cam]))) if turns else 0.0
     return turns if up[turns] > max(_LEAST_UPRIGHT, by_y) else None
 
 

@@ -93,7 +93,7 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
                 rows = file.read(columns=columns, use_threads=False).to_pylist()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             said = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise SourceError(f"{path} is no table that can be read ({said[:160]}); copy it again") from None
+            raise SourceError(f"{path} is not a table that can be read ({said[:160]}); copy it again") from None
         found |= {int(row["episode_index"]): row for row in (_sound(path, row, columns) for row in rows)}
     if not found:
         raise SourceError(f"{root} has no episodes in meta/episodes; was the copy finished?")

@@ -15,6 +15,8 @@ from list3r.frames.recordings.axes import pose_of_quaternion
 Array = NDArray[np.float64]
 WORLDS = ("map", "world", "odom", "vicon", "mocap")
 """Frames of reference in which a camera is placed, the most lasting first."""
+DRIFTING = "odom"
+"""The one in which poses drift, by its definition (REP 105)."""
 _LONGEST_CHAIN = 64
 
 

@@ -22,7 +22,7 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
     """Return what the layout knows, overruled by what the user says, with notes on what that leaves to assume."""
     optics, notes = layout.optics, []
     if options.registered:
-        optics = replace(optics, depth_intrinsics=None, T_color_depth=None)
+        optics = replace(optics, depth_intrinsics=None, T_color_depth=None, shares_view=False)
         if layout.registered_intrinsics is not None:
             optics = replace(optics, intrinsics=layout.registered_intrinsics, distortion=())
     given: dict[str, Any] = {
@@ -36,7 +36,7 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
     if options.distortion is not None:
         optics = replace(optics, fisheye=False)
     if options.intrinsics is not None:
-        optics = replace(optics, intrinsics_size=None)
+        optics = replace(optics, intrinsics_size=None, said=True)
     if options.depth_intrinsics is not None:
         optics = replace(optics, depth_intrinsics_size=None)
     if optics.T_color_depth is not None and optics.depth_intrinsics is None:
@@ -64,6 +64,8 @@ class Rig:
     max_depth_m: float | None
     undistortion: Undistortion | None
     registration: DepthReprojection | None
+    shares_view: bool = False
+    """Depth is of the colour camera itself, so that a picture with a camera of its own has depth of that camera."""
 
     def color(self, image: NDArray[np.uint8], lens: Camera | None = None) -> NDArray[np.uint8]:
         """Undistorted colour of a picture, which may have a camera of its own. Shape (H, W, 3).
@@ -91,11 +93,17 @@ class Rig:
         """Undistorted colour of a picture that has the size of the frames handed out. Shape (H, W, 3)."""
         return image if self.undistortion is None else self.undistortion.color(image)
 
-    def depth(self, raw: NDArray[Any]) -> NDArray[np.float32]:
-        """Metric depth on the pixels of `camera`. Shape (H, W). Raises `FrameError` for another size."""
+    def depth(self, raw: NDArray[Any], lens: Camera | None = None) -> NDArray[np.float32]:
+        """Metric depth on the pixels of `camera`, seen by a camera of its own where the picture has one. Shape (H, W).
+
+        Raises `FrameError` for another size.
+        """
         if raw.shape != self.depth_size:
             raise FrameError(f"depth is {_size(raw.shape)}, most frames {_size(self.depth_size or (0, 0))}")
         depth = clean_depth(raw, self.depth_scale, self.max_depth_m)
+        if lens is not None and self.shares_view and self.camera is not None:
+            own = lens.pinhole().resized(*raw.shape)
+            return depth if own == self.camera else DepthReprojection(own, self.camera, np.eye(4))(depth)
         if self.registration is not None:
             depth = self.registration(depth)
             return depth if self.undistortion is None else depth * self.undistortion.seen
@@ -123,6 +131,8 @@ def build_rig(
         raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
+    if optics.intrinsics is not None and not optics.said:
+        _check_size(optics.intrinsics, optics.intrinsics_size or stored_size)
     stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
     if stated is not None and optics.fisheye:
         stated = replace(stated, fisheye=True)
@@ -134,14 +144,22 @@ def build_rig(
     if depth_size is not None:
         if optics.depth_scale is None:
             raise SourceError("the units of the depth images are unknown; give --depth-scale UNITS_PER_METRE")
-        registration = _registration(optics, camera, depth_size, stored_size)
-    scale = optics.depth_scale or 1.0
-    return Rig(camera, stored_size, color_size, depth_size, scale, max_depth_m, undistortion, registration)
+        registration = _registration(optics, whole, camera, (depth_size, stored_size))
+    scale, shared = optics.depth_scale or 1.0, _is_shared(optics)
+    return Rig(camera, stored_size, color_size, depth_size, scale, max_depth_m, undistortion, registration, shared)
+
+
+def _is_shared(optics: Optics) -> bool:
+    return optics.shares_view and optics.depth_intrinsics is None and optics.intrinsics is not None
 
 
 def _registration(
-    optics: Optics, camera: Camera | None, depth_size: tuple[int, int], color_size: tuple[int, int]
+    optics: Optics, whole: Camera | None, camera: Camera | None, sizes: tuple[tuple[int, int], tuple[int, int]]
 ) -> DepthReprojection | None:
+    depth_size, color_size = sizes
+    if whole is not None and camera is not None and _is_shared(optics):
+        own = _of_size(whole.pinhole(), depth_size, "the depth images")
+        return None if own is None or own == camera else DepthReprojection(own, camera, np.eye(4))
     if optics.depth_intrinsics is None:
         if depth_size != color_size:
             raise SourceError(
@@ -196,6 +214,21 @@ def _camera(
     return Camera(width, height, fx, fy, cx, cy, distortion)
 
 
+def _check_size(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
+    """Raise `OptionError` for a camera whose centre is plainly the middle of pictures of another size."""
+    (fx, fy, cx, cy), (height, width) = intrinsics, size
+    x, y = (2 * cx + 1) / width, (2 * cy + 1) / height
+    if not (min(x, y) > 0 and abs(x / y - 1) <= _ALIKE and (x <= 1 / _OTHER_SIZE or x >= _OTHER_SIZE)):
+        return
+    fitting = ",".join(f"{v:.6g}" for v in (fx / x, fy / y, (cx + 0.5) / x - 0.5, (cy + 0.5) / y - 0.5))
+    raise OptionError(
+        f"the source states a camera for pictures of {width}x{height} whose centre ({cx:g}, {cy:g}) is the middle of "
+        f"some of {round(x * width)}x{round(y * height)}; --intrinsics {fitting} would be that camera here"
+    )
+
+
+_ALIKE, _OTHER_SIZE = 0.05, 1.6
+"""A centre that is as many times too far in x and y, within a share, is that of another size; from this factor on."""
 _OFF_MIDDLE, _IN_MIDDLE = 0.1, 0.05
 """A camera's centre from the middle, as a share of the side: of pictures turned by a quarter, and of its own."""
 

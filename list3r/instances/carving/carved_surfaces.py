@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import pack
 from list3r.memory.geometry import Array
-from list3r.memory.overlap.visibility import FREE, MET, DepthView, VisibilitySettings, tell
+from list3r.memory.overlap.visibility import FREE, MET, DepthView, VisibilitySettings, point_visibility
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -90,7 +90,7 @@ def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: C
         met, free = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
         for view in views:
             rows = blocks.seen_by(view, s.visibility.most_depth_m)
-            told = tell(points[rows], view, s.visibility)
+            told = point_visibility(points[rows], view, s.visibility)
             met[rows[told == MET]] += 1
             free[rows[told == FREE]] += 1
         counts[name] = met, free

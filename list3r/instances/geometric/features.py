@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 _CHROMA_BINS = 24
 _LIGHT_BINS = 12
-_SIZE_BINS = 16
 
 
 def object_feature(

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from list3r.instances.learned.agglomeration import STRONGEST, agglomerate
 from list3r.instances.learned.graph import ChunkSurface, PieceGraph, piece_graph
-from list3r.instances.learned.network import Judgement, Weights, judge
+from list3r.instances.learned.network import Classification, Weights, classify
 from list3r.instances.learned.pieces import Pieces, cut_pieces
-from list3r.instances.learned.things import ThingVerdicts, judge_things
+from list3r.instances.learned.things import ThingVerdicts, classify_things
 
 
 @dataclass(frozen=True)
@@ -52,25 +52,25 @@ def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | N
     own = agglomerate(len(graph.nodes), graph.left, graph.right, told.affinity, graph.weight, s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
-    return CloudCut(labels, judge_things(weights, own, graph, told))
+    return CloudCut(labels, classify_things(weights, own, graph, told))
 
 
 def join_parts(
     surface: ChunkSurface, pieces: Pieces, weights: Weights, s: CutSettings
-) -> tuple[NDArray[np.int32], PieceGraph, Judgement]:
+) -> tuple[NDArray[np.int32], PieceGraph, Classification]:
     """Return the part of each voxel (N,), -1 for none, the parts' graph, and what the second network says of it.
 
     Only what is surely one is joined at a time; then size, place and borders of what came of it are measured again, so
     that no early join is decided by small pieces that could not yet tell.
     """
-    g, told = pieces.graph, judge(weights, "fine", pieces.graph)
+    g, told = pieces.graph, classify(weights, "fine", pieces.graph)
     own = agglomerate(len(g.nodes), g.left, g.right, told.affinity, g.weight, s.sure)
     for end in s.steps:
         _, graph = group(surface, pieces, told, own)
-        said = judge(weights, "coarse", graph).affinity
+        said = classify(weights, "coarse", graph).affinity
         own = agglomerate(len(graph.nodes), graph.left, graph.right, said, graph.weight, end)[own]
     labels, graph = group(surface, pieces, told, own)
-    return labels, graph, judge(weights, "coarse", graph)
+    return labels, graph, classify(weights, "coarse", graph)
 
 
 def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: float) -> NDArray[np.int32]:
@@ -101,7 +101,7 @@ def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: 
 
 
 def group(
-    surface: ChunkSurface, pieces: Pieces, told: Judgement, own: NDArray[np.int64]
+    surface: ChunkSurface, pieces: Pieces, told: Classification, own: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], PieceGraph]:
     """Return the group of each voxel (N,), -1 for none, and the groups' graph with what the first network said.
 
@@ -132,7 +132,9 @@ number of pieces."""
 EXTRA_EDGES = 4
 
 
-def _told_between(g: PieceGraph, told: Judgement, own: NDArray[np.int64], graph: PieceGraph) -> NDArray[np.float64]:
+def _told_between(
+    g: PieceGraph, told: Classification, own: NDArray[np.int64], graph: PieceGraph
+) -> NDArray[np.float64]:
     """Mean, least and greatest affinity of the fine borders between two parts, and their number. (E, EXTRA_EDGES)."""
     count = len(graph.nodes)
     codes = graph.left * count + graph.right

@@ -15,7 +15,7 @@ Weights = Mapping[str, Float]
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Classification:
     """What a network says of a graph of P pieces and E borders."""
 
     affinity: Float
@@ -28,7 +28,7 @@ class Judgement:
     """What the network makes of each piece. Shape (P, H)."""
 
 
-def judge(weights: Weights, prefix: str, graph: PieceGraph) -> Judgement:
+def classify(weights: Weights, prefix: str, graph: PieceGraph) -> Classification:
     """Run the network `prefix` of the weights; `training.model.PieceNetwork` is its twin that can be trained."""
     w = _Layers(weights, prefix)
     count = len(graph.nodes)
@@ -52,7 +52,7 @@ def judge(weights: Weights, prefix: str, graph: PieceGraph) -> Judgement:
     names = heads[:, 1:]
     names = names - names.max(axis=1, keepdims=True)
     names = names - np.log(np.exp(names).sum(axis=1, keepdims=True))
-    return Judgement(w.two("pair_head", pair)[:, 0], heads[:, 0], names, h)
+    return Classification(w.two("pair_head", pair)[:, 0], heads[:, 0], names, h)
 
 
 def two_layers(weights: Weights, name: str, x: Float) -> Float:

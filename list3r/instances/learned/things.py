@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.learned.agglomeration import STRONGEST
-from list3r.instances.learned.belief import NameBelief, believed, name_signs
 from list3r.instances.learned.graph import PieceGraph
-from list3r.instances.learned.network import Judgement, Weights, two_layers
+from list3r.instances.learned.name_confidence import NameConfidence, name_signs, with_confidence
+from list3r.instances.learned.network import Classification, Weights, two_layers
 
 Float = NDArray[np.float32]
 
@@ -43,19 +43,23 @@ def names_of(weights: Weights) -> tuple[str, ...]:
     return tuple(weights["names"].tolist())
 
 
-def judge_things(
-    weights: Weights, own: NDArray[np.int64], graph: PieceGraph, told: Judgement, belief: NameBelief | None = None
+def classify_things(
+    weights: Weights,
+    own: NDArray[np.int64],
+    graph: PieceGraph,
+    told: Classification,
+    confidence: NameConfidence | None = None,
 ) -> ThingVerdicts:
-    """Judge clusters of parts; `own` is the cluster of each part, from 0. Shape (P,)."""
+    """Classify clusters of parts; `own` is the cluster of each part, from 0. Shape (P,)."""
     structure, x = thing_features(own, graph, told)
     whole, names = first_verdicts(weights, x)
     signs = name_signs(names, whole, structure)
-    names = believed(names, (belief or NameBelief()).probability(signs))
+    names = with_confidence(names, (confidence or NameConfidence()).probability(signs))
     return ThingVerdicts(structure.astype(np.float32), whole.astype(np.float32), names.astype(np.float32))
 
 
 def first_verdicts(weights: Weights, x: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the probabilities of being one whole (T,) and of the names (T, C) by what the judge was trained on."""
+    """Return the probabilities of being one whole (T,) and of the names (T, C) as the network learned them."""
     out = two_layers(
         weights, "things.net", np.asarray((x - weights["things.mean"]) / weights["things.std"], np.float32)
     )
@@ -67,7 +71,7 @@ def first_verdicts(weights: Weights, x: NDArray[np.float32]) -> tuple[NDArray[np
 
 
 def thing_features(
-    own: NDArray[np.int64], graph: PieceGraph, told: Judgement
+    own: NDArray[np.int64], graph: PieceGraph, told: Classification
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return how probably each cluster is structure (T,), and what verdicts are told from (T, F)."""
     count, size = int(own.max(initial=-1)) + 1, graph.moments[:, 0].astype(np.float64)
@@ -99,7 +103,11 @@ def thing_features(
 
 
 def _borders(
-    own: NDArray[np.int64], graph: PieceGraph, told: Judgement, outline: NDArray[np.float64], bound: NDArray[np.float64]
+    own: NDArray[np.int64],
+    graph: PieceGraph,
+    told: Classification,
+    outline: NDArray[np.float64],
+    bound: NDArray[np.float64],
 ) -> list[NDArray[np.float64]]:
     """How tight clusters are inside, how loose outside, and how much of their rim is at structure. Shape (T,) each."""
     count = len(outline)

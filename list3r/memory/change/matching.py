@@ -13,7 +13,7 @@ from list3r.memory.change.surface_colors import palette_distance
 from list3r.memory.constraints import Constraints
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
-from list3r.memory.overlap.visibility import Look
+from list3r.memory.overlap.visibility import PlaceVisibility
 from list3r.memory.records import MergeDecision
 
 _NEVER = 1e6
@@ -101,10 +101,12 @@ class ChangeMatching:
             for place, box in left.items()
         )
 
-    def _missing(self, session: int, components: set[int], fresh: Sequence[int]) -> list[tuple[_PlacedInstance, Look]]:
+    def _missing(
+        self, session: int, components: set[int], fresh: Sequence[int]
+    ) -> list[tuple[_PlacedInstance, PlaceVisibility]]:
         """Return the instances that are gone from where they were; all others that were known are given their state."""
         p = self._p
-        gone: list[tuple[_PlacedInstance, Look]] = []
+        gone: list[tuple[_PlacedInstance, PlaceVisibility]] = []
         for placed in self._instances():
             if p.sessions[placed.now][0] >= session or p.component[placed.now] not in components:
                 continue
@@ -116,7 +118,7 @@ class ChangeMatching:
                 gone += [] if found is None else [(placed, found)]
         return gone
 
-    def _look_for(self, placed: _PlacedInstance, fresh: Sequence[int], session: int) -> Look | None:
+    def _look_for(self, placed: _PlacedInstance, fresh: Sequence[int], session: int) -> PlaceVisibility | None:
         """Return what frames tell about the place of an instance that was not found again, if it is gone from there."""
         p = self._p
         placed.state = "unseen"
@@ -131,7 +133,7 @@ class ChangeMatching:
             self._still_there(placed, session, found)
         return None
 
-    def _taken(self, n: int, found: Look, fresh: Sequence[int], session: int) -> bool:
+    def _taken(self, n: int, found: PlaceVisibility, fresh: Sequence[int], session: int) -> bool:
         """Return whether something new stands where an instance was: what is not seen through of it lies at that."""
         p, s = self._p, self._s
         if found.verdict == "unseen" or p.changed(n, session, before=True) < s.seen_through:
@@ -143,7 +145,6 @@ class ChangeMatching:
     def _displaced_by(self, n: int, fresh: Sequence[int], session: int) -> int | None:
         """Something new of other looks that is where most of an instance was: two instances are never at one place."""
         p, s = self._p, self._s
-        old = p.looks(n, session, before=True).palette
         for m in fresh:
             if p.component[m] != p.component[n]:
                 continue
@@ -151,9 +152,10 @@ class ChangeMatching:
                 return m
             if p.changed(m, session, before=False) >= s.mostly_new:
                 box = p.box(m, session, before=False, stayed=True)
-                new = p.looks(m, session, before=False).palette
-                inside = p.inside(n, box, 0.0, session, before=True) >= s.displaced
-                if inside and palette_distance(old, new) > s.other_palette:
+                if p.inside(n, box, 0.0, session, before=True) < s.displaced:
+                    continue
+                old, new = (p.looks(k, session, before=k == n).palette for k in (n, m))
+                if palette_distance(old, new) > s.other_palette:
                     return m
         return None
 
@@ -207,7 +209,7 @@ class ChangeMatching:
                 Change(self._first(placed), session, kind, before, after, p.evidence(place, session), sure, reason),
             )
 
-    def _still_there(self, placed: _PlacedInstance, session: int, found: Look) -> None:
+    def _still_there(self, placed: _PlacedInstance, session: int, found: PlaceVisibility) -> None:
         placed.state = "present"
         box = self._p.box(placed.now, session, before=True, stayed=True)
         reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
@@ -216,7 +218,7 @@ class ChangeMatching:
             Change(self._first(placed), session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason),
         )
 
-    def _remove(self, placed: _PlacedInstance, session: int, found: Look) -> None:
+    def _remove(self, placed: _PlacedInstance, session: int, found: PlaceVisibility) -> None:
         placed.state = "removed"
         box = self._p.box(placed.now, session, before=True)
         reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
@@ -224,7 +226,7 @@ class ChangeMatching:
             placed, Change(self._first(placed), session, "removed", box, None, found.frames, self._sure(found), reason)
         )
 
-    def _add(self, place: int, session: int, found: Look) -> None:
+    def _add(self, place: int, session: int, found: PlaceVisibility) -> None:
         placed = self._placed[place]
         placed.state = "added"
         box = self._p.box(place, session, before=False)
@@ -237,7 +239,7 @@ class ChangeMatching:
             Change(self._first(placed), session, "added", None, box, self._p.evidence(place, session), sure, reason),
         )
 
-    def _move(self, move: _Move, session: int, found: Look) -> None:
+    def _move(self, move: _Move, session: int, found: PlaceVisibility) -> None:
         p, placed, place = self._p, move.placed, move.place
         old, new = p.box(placed.now, session, before=True), p.box(place, session, before=False)
         a, b = p.groups[placed.now][0], p.groups[place][0]
@@ -259,7 +261,7 @@ class ChangeMatching:
         placed.now, placed.state = place, "present" if stayed else "moved"
         del self._placed[place]
 
-    def _sure(self, found: Look) -> float:
+    def _sure(self, found: PlaceVisibility) -> float:
         """Return how certain it is that what frames see through is gone."""
         frames = len(found.frames)
         return float(max(found.free, self._s.least_sure) * frames / (frames + 1.0))
@@ -271,7 +273,9 @@ class ChangeMatching:
         change = replace(change, frames=change.frames[:8], confidence=round(change.confidence, 3))
         self._events.append((placed.places[0], change))
 
-    def _moves(self, gone: Sequence[tuple[_PlacedInstance, Look]], fresh: Sequence[int], session: int) -> list[_Move]:
+    def _moves(
+        self, gone: Sequence[tuple[_PlacedInstance, PlaceVisibility]], fresh: Sequence[int], session: int
+    ) -> list[_Move]:
         """Return pairs of what is gone and what is new, one to one, of least difference in all."""
         from scipy.optimize import linear_sum_assignment
 

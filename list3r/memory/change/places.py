@@ -23,7 +23,15 @@ from list3r.memory.change.surface_colors import (
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
 from list3r.memory.overlap.summaries import ChunkSummary, world_unit
-from list3r.memory.overlap.visibility import DepthView, Look, changed_points, look, seen_through_share, tally, views_of
+from list3r.memory.overlap.visibility import (
+    DepthView,
+    PlaceVisibility,
+    changed_points,
+    place_visibility,
+    seen_through_share,
+    tally,
+    views_of,
+)
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChunkRow
 from list3r.memory.relations.instance_geometry import fit_box
@@ -136,28 +144,28 @@ class Places:
         off = np.abs((points - box.center) @ box.rotation)
         return float(np.mean(np.all(off <= box.size / 2 + slack_m * self.unit, axis=1)))
 
-    def look_after(self, n: int, session: int) -> Look:
+    def look_after(self, n: int, session: int) -> PlaceVisibility:
         """Return what a session's frames see where an instance was before."""
         points = self.points(n, session, before=True)
         return self._look(points, self._views_of(session, self.component[n]), session)
 
-    def look_before(self, n: int, session: int) -> Look:
+    def look_before(self, n: int, session: int) -> PlaceVisibility:
         """Return what the frames of the last session that could tell saw where an instance is now."""
         points = self.points(n, session, before=False)
         for views in self._views_before(n, session):
             found = self._look(points, views, session)
             if found.verdict != "unseen":
                 return found
-        return Look("unseen", 0.0, ())
+        return PlaceVisibility("unseen", 0.0, ())
 
-    def _look(self, points: Array, views: Sequence[DepthView], session: int) -> Look:
+    def _look(self, points: Array, views: Sequence[DepthView], session: int) -> PlaceVisibility:
         """Return what frames see at a place; nothing is told of what may be there as the session may lie."""
-        found, s = look(points, views, self._s.visibility), self._s
+        found, s = place_visibility(points, views, self._s.visibility), self._s
         if found.verdict == "gone":
             known = s.visibility.tolerance_m * self.unit
             for shift in self.ties.shifts(session, points.mean(axis=0), s.placed_deviations, known):
-                if look(points + shift, views, s.visibility).verdict != "gone":
-                    return Look("unseen", 0.0, ())
+                if place_visibility(points + shift, views, s.visibility).verdict != "gone":
+                    return PlaceVisibility("unseen", 0.0, ())
         return found
 
     def changed(self, n: int, session: int, *, before: bool) -> float:

@@ -1,4 +1,4 @@
-"""Text of strangers on one line that can be printed."""
+"""Text of unknown origin on one line that can be printed."""
 
 from __future__ import annotations
 

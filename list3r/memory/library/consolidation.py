@@ -18,15 +18,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
-import numpy as np
-
 from list3r.memory.change.ledger import ChangeLedger, Group, read_ledger, write_ledger
 from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.redundancy import cull, follow
 from list3r.memory.library.region import DirtySet, Region
-from list3r.memory.library.rows import in_light, log_decisions, moved
+from list3r.memory.library.rows import carry_instances, in_light, log_decisions, put_exactly
 from list3r.memory.library.rules import (
     WORLD,
     ConsolidationReport,
@@ -36,16 +34,16 @@ from list3r.memory.library.rules import (
     known_world,
     last_edit,
     look_at_world,
+    obeys,
     settings_of,
 )
 from list3r.memory.library.session_changes import SessionChanges
-from list3r.memory.library.settled_poses import settle, settled_chunks
-from list3r.memory.library.uncertainty import position_sigma
+from list3r.memory.library.settled_poses import Carried, CarrySettings, carry, extent_of, settle, settled_chunks
 from list3r.memory.library.weighing import Weighing
 from list3r.memory.library.writing import Writer
 from list3r.memory.overlap.summaries import Summaries, chunk_summaries
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.library import Anchor
+from list3r.memory.store.tables.library import SettledRow
 
 __all__ = ["ConsolidationReport", "ConsolidationSettings", "consolidate"]
 
@@ -70,12 +68,17 @@ def consolidate(
         return ConsolidationReport(0, 0, (), (), 0)
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
     summaries, before = chunk_summaries(store, s.shapes, hold=True), store.library.settled.all()
-    ledger, known = read_ledger(store, chunks), store.facts[WORLD]
+    ledger = read_ledger(store, chunks)
+    carried = _carry(store, summaries, s) if ended and ledger is not None else None
+    known = store.facts[WORLD]
     world = _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))
+    if carried is not None:
+        moved, before = moved | carried.dirty, {**carried.rows, **carried.before}
     whole = False
     if ledger is None or world is None or _most_moved(store, moved, len(before), world, s):
         moved |= settle(store, summaries, s.hysteresis)
+        store.library.settled.rest()
         world, whole = look_at_world(store, settled_chunks(store), summaries, s), True
     region = Region(store, summaries, world, s)
     edited = edited_since(store, 0 if whole else world.edits)
@@ -90,10 +93,42 @@ def consolidate(
     if not whole and known is not None and world.light != known.light:
         _describe_anew(region)
     if ended and not dirty.whole:
-        _put_exactly(region, report.written or ())
+        put_exactly(store, {k: region.pose(k) for k in region.settled}, report.written or ())
     store.facts[WORLD] = replace(world, edits=last_edit(store))
     store.library.touched = set()
     return report
+
+
+def _carry(store: Store, summaries: Summaries, s: ConsolidationSettings) -> Carried | None:
+    """Carry what was derived to where its chunks lie now, where several have moved and most of them as their neighbours
+    did; return what was carried.
+    """
+    chunks, known = store.chunks.all(), store.facts[WORLD]
+    rows = store.library.settled.all()
+    if known is None or len(rows) <= s.whole_chunks or not obeys(known, store, chunks, s):
+        return None
+    T_world_graph = store.facts.S_world_graph
+    if abs(float(known.T_world_graph.scale / T_world_graph.scale) - 1.0) > s.hysteresis.scale:
+        return None
+    upright = known.first if known.upright else None
+    metre = known.unit / float(T_world_graph.scale)
+    settings = CarrySettings(s.hysteresis, s.gravity.hysteresis_deg, metre, upright)
+    found = carry(store, known.T_world_graph, settings)
+    if found is None or len(found.dirty) > max(2, s.whole_share * len(rows)):
+        return None
+    store.library.settled.carry({k: row for k, row in found.rows.items() if k not in found.dirty})
+    store.library.settled.put(
+        {
+            k: SettledRow(row.component, row.S_graph_chunk, extent_of(summaries[k], row.S_graph_chunk))
+            for k, row in found.rows.items()
+            if k in found.dirty
+        }
+    )
+    store.library.overlaps.drop(found.apart)
+    store.library.overlaps.put(dict.fromkeys(found.together, b""))
+    carry_instances(store, found.moves, upright)
+    store.facts[WORLD] = replace(known, T_world_graph=T_world_graph)
+    return found
 
 
 def _standing_world(store: Store, summaries: Summaries, s: ConsolidationSettings, *, ended: bool) -> World | None:
@@ -172,24 +207,3 @@ def _describe_anew(region: Region) -> None:
         (a, (a.description, a.color_name) != (b.description, b.color_name)) for a, b in zip(after, before, strict=True)
     ]
     store.instances.put(a for a, others in words if others)
-
-
-def _put_exactly(region: Region, written: Collection[int]) -> None:
-    """Move the boxes of instances that were not written anew to where their chunks lie to the last digit, which is
-    less far than makes them be derived anew.
-    """
-    store = region.store
-    fresh: dict[int, Anchor] = {}
-    records = []
-    for n, anchor in store.library.anchors.all().items():
-        now = store.chunks.get(anchor.chunk_id).S_world_chunk @ region.pose(anchor.chunk_id).inverse()
-        if n in written or np.array_equal(now.as_matrix(), anchor.S_exact_settled.as_matrix()):
-            continue
-        (instance,) = store.instances.of([n])
-        there = moved(moved(instance, anchor.S_exact_settled.inverse()), now)
-        seen_by = sorted({o.chunk_id for o in store.observations.of(n)} & region.rows.keys())
-        seen_in = [store.chunks.get(k) for k in seen_by]
-        records.append(replace(there, position_sigma_m=position_sigma(there.center, seen_in)))
-        fresh[n] = Anchor(anchor.chunk_id, now)
-    store.instances.put(records)
-    store.library.anchors.put(fresh)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.library.uncertainty import ConfidenceWeights, signs_of
-from list3r.memory.overlap.missed import LookSettings, bears_out, frames_beside, misses
+from list3r.memory.overlap.missed import MissedSettings, frames_beside, misses, pictures_confirm
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
 from list3r.memory.overlap.voxels import ChunkShapes, Ints
 
@@ -36,7 +36,7 @@ class EvidenceSettings:
     """Edge of the cells in which the claims of instances to a place are counted."""
     claims: int = 4
     """A bit that one chunk alone gives to an instance, and this many to another, is not part of it."""
-    looks: LookSettings = field(default_factory=LookSettings)
+    looks: MissedSettings = field(default_factory=MissedSettings)
     """When a chunk of computed depth has missed an instance."""
 
 
@@ -97,7 +97,8 @@ def weigh(
         swallowed = np.flatnonzero((a != b) & weighed[a] & (cover >= settings.swallowed))
         met = zip(inner[swallowed].tolist(), outer[swallowed].tolist(), strict=True)
         agreed = [
-            bears_out(numbering.keys[x], numbering.keys[y], chunks, beside, settings.looks.least_share) for x, y in met
+            pictures_confirm(numbering.keys[x], numbering.keys[y], chunks, beside, settings.looks.least_share)
+            for x, y in met
         ]
         swallowed = swallowed[np.array(agreed, bool)]
         seen_by = chunk_of[outer[swallowed]].tolist()

@@ -54,7 +54,7 @@ class _LinkedPair:
     """A pair of chunks, valid as long as neither is settled anew."""
 
     rows: tuple[SettledRow, SettledRow]
-    stamp: int
+    stamp: tuple[int, bytes]
     scores: PairScores
     links: Links
 

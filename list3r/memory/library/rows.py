@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Swatch, color_words, main_color
 from list3r.memory.description.describe import describe
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Array, Sim3
+from list3r.memory.geometry import Array, OrientedBox, Sim3, rotation_exp
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.instances import DerivedInstance
 from list3r.memory.library.rules import World
+from list3r.memory.library.settled_poses import stacked
+from list3r.memory.library.uncertainty import position_sigmas
 from list3r.memory.overlap.pair_scores import Key, PairScores
 from list3r.memory.records import Instance, MergeDecision
 from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.library import Looks
+from list3r.memory.store.tables.library import Anchor, Looks
 
 _SCORES = np.dtype(
     [("i", "<i4"), ("j", "<i4"), ("i_on_j", "<f8"), ("j_on_i", "<f8"), ("shared", "<i4"), ("frame_iou", "<f8")]
@@ -109,6 +111,87 @@ def moved(instance: Instance, S: Sim3) -> Instance:
     by = S.apply(instance.center[None])[0] - instance.center
     box = replace(instance.box, center=instance.box.center + by)
     return replace(instance, center=instance.center + by, aabb=instance.aabb + by, box=box)
+
+
+def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[int]) -> None:
+    """Move the boxes of instances that were not `written` anew to where their chunks lie to the last digit, which is
+    less far than makes them be derived anew. `settled` are S_world_chunk of where chunks are settled.
+    """
+    known = {n: a for n, a in store.library.anchors.all().items() if n not in written}
+    hung = sorted({a.chunk_id for a in known.values()})
+    exact = {k: store.chunks.get(k).S_world_chunk @ settled[k].inverse() for k in hung}
+    lie = np.array([exact[a.chunk_id].as_matrix() for a in known.values()]).reshape(-1, 4, 4)
+    lay = np.array([a.S_exact_settled.as_matrix() for a in known.values()]).reshape(-1, 4, 4)
+    elsewhere = (np.abs(lie - lay) > _ROUNDED).any(axis=(1, 2)).tolist()
+    others = {n: a for (n, a), move in zip(known.items(), elsewhere, strict=True) if move}
+    for some in _batches(sorted(others)):
+        instances = store.instances.of(some)
+        before = stacked([others[i.id].S_exact_settled for i in instances])
+        now = stacked([exact[others[i.id].chunk_id] for i in instances])
+        by = now.apply(before.inverse().apply(_centers(instances)[:, None]))[:, 0] - _centers(instances)
+        there = [
+            replace(i, center=i.center + d, aabb=i.aabb + d, box=replace(i.box, center=i.box.center + d))
+            for i, d in zip(instances, by, strict=True)
+        ]
+        store.instances.put(with_sigma(store, there))
+    store.library.anchors.put({n: Anchor(a.chunk_id, exact[a.chunk_id]) for n, a in others.items()})
+
+
+def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None) -> None:
+    """Carry instances along with the chunks that they hang on: `moves` lead by chunk from where it was settled in the
+    world to where it lies. Boxes in the component that is `upright` stay so; a box along the axes grows or shrinks as
+    the one round the turned box does.
+    """
+    anchors = store.library.anchors.all()
+    for some in _batches(sorted(anchors)):
+        instances = store.instances.of(some)
+        exact = stacked([anchors[i.id].S_exact_settled for i in instances])
+        by = stacked([moves[anchors[i.id].chunk_id] for i in instances])
+        center, aabb = _centers(instances)[:, None], np.array([i.aabb for i in instances])
+        size, rotation = np.array([i.box.size for i in instances]), np.array([i.box.rotation for i in instances])
+        derived = exact.inverse().apply(center)
+        stands = np.array([i.component == upright for i in instances])[:, None, None]
+        turned = np.where(stands, _about_z(by.rotation), by.rotation) @ rotation
+        before, now = ((np.abs(R) @ size[..., None])[..., 0] for R in (rotation, turned))
+        half = by.scale[:, None] * np.ptp(aabb, axis=1) / 2.0 * now / np.maximum(before, 1e-12)
+        middle = by.apply(aabb.mean(axis=1)[:, None] + derived - center)
+        boxes = np.concatenate([middle - half[:, None], middle + half[:, None]], axis=1)
+        rows = zip(instances, by.apply(derived)[:, 0], boxes, by.scale[:, None] * size, turned, strict=True)
+        there = [replace(i, center=c, aabb=a, box=OrientedBox(c, edges, R)) for i, c, a, edges, R in rows]
+        store.instances.put(with_sigma(store, there))
+    store.library.anchors.put({n: Anchor(a.chunk_id, Sim3.identity()) for n, a in anchors.items()})
+
+
+def with_sigma(store: Store, instances: Sequence[Instance]) -> list[Instance]:
+    """Return instances with how well it is known where they are, by all chunks that saw them and take part."""
+    at, redundant = {i.id: n for n, i in enumerate(instances)}, store.library.redundant.chunks()
+    seen = [(at[i], k) for i, k in store.observations.chunks_of(sorted(at)) if k not in redundant]
+    owner, chunk = np.array(seen, np.int64).reshape(-1, 2).T
+    ids, number = np.unique(chunk, return_inverse=True)
+    sigma = position_sigmas(_centers(instances), owner, number, [store.chunks.get(int(k)) for k in ids])
+    return [replace(i, position_sigma_m=s) for i, s in zip(instances, sigma, strict=True)]
+
+
+_ROUNDED = 1e-9
+"""What products of poses round, and nothing is moved for."""
+_TOGETHER = 2048
+"""Instances that are moved at once."""
+
+
+def _batches(ids: Sequence[int]) -> Iterator[Sequence[int]]:
+    for first in range(0, len(ids), _TOGETHER):
+        yield ids[first : first + _TOGETHER]
+
+
+def _centers(instances: Sequence[Instance]) -> Array:
+    """Shape (N, 3)."""
+    return np.array([i.center for i in instances]).reshape(-1, 3)
+
+
+def _about_z(rotation: Array) -> Array:
+    """Return the part of rotations that is about z. Shape (N, 3, 3) -> (N, 3, 3)."""
+    yaw = np.arctan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1])
+    return rotation_exp(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
 
 
 def log_decisions(

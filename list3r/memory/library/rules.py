@@ -11,6 +11,7 @@ import numpy as np
 from list3r.memory.change.detection import ChangeSettings
 from list3r.memory.constraints import Key
 from list3r.memory.description.colors import Reference
+from list3r.memory.geometry import Sim3
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.instances import DeriveSettings
 from list3r.memory.library.labels import LabelSettings
@@ -105,8 +106,8 @@ class World:
     unit: float
     """What a metre is in world units."""
     light: Reference
-    floor: float | None
-    """Height of the floor; None where it was not seen or nobody knows which way is up."""
+    floor_seen: bool
+    """Whether the floor was seen and somebody knows which way is up; how high it is, is told place by place."""
     upright: bool
     """Whether z is up, in the first component."""
     first: int
@@ -117,35 +118,38 @@ class World:
     """Posed frames, counted up to 80: fewer are asked of an instance in a short memory."""
     space: str
     """The embedding space of all chunks; empty where they have several."""
-    stamp: int
-    """Of the settings, and of where the graph's frame lies in the world."""
+    rules: int
+    """A checksum of the settings and of the kind of scale."""
+    T_world_graph: Sim3
+    """Where the graph's frame lies in the world."""
     edits: int = 0
     """The last edit of an operator that was obeyed."""
 
+    @property
+    def stamp(self) -> tuple[int, bytes]:
+        """What tells apart the rules and the frame of the world."""
+        return self.rules, self.T_world_graph.as_matrix().tobytes()
+
     def near(self, other: World) -> bool:
-        """Return whether what was derived with the other one holds: the light, the unit and the floor may differ a
-        little.
-        """
-        if (self.upright, self.first, self.posed, self.space, self.stamp) != (
+        """Return whether what was derived with the other one holds: the light and the unit may differ a little."""
+        if (self.upright, self.first, self.posed, self.space, self.floor_seen, self.rules) != (
             other.upright,
             other.first,
             other.posed,
             other.space,
-            other.stamp,
-        ):
+            other.floor_seen,
+            other.rules,
+        ) or not _same_frame(self.T_world_graph, other.T_world_graph):
             return False
-        if (self.floor is None) != (other.floor is None) or abs(self.unit / other.unit - 1.0) > _UNIT:
-            return False
-        risen = 0.0 if self.floor is None or other.floor is None else abs(self.floor - other.floor)
         cast = float(np.hypot(*np.subtract(self.light.cast_ab, other.light.cast_ab)))
         lit = abs(self.light.white_l - other.light.white_l) <= _WHITE_L and cast <= _CAST
-        return lit and risen <= _FLOOR_M * self.unit
+        return lit and abs(self.unit / other.unit - 1.0) <= _UNIT
 
 
 WORLD = Fact[World | None]("library", World, None)
 """What the library was derived with; None where it has to be derived as a whole."""
 
-_UNIT, _FLOOR_M = 0.02, 0.03
+_UNIT = 0.02
 _CAMERA_M = 1.4
 """Height at which people hold a camera; medians of recordings of others are 1.10, 1.42, 1.47 and 1.57 m (TUM
 fr3_cabinet, 7-Scenes RedKitchen, TUM fr2_desk and fr1_xyz)."""
@@ -169,13 +173,14 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
     return World(
         unit=unit,
         light=light_of(chunks, summaries),
-        floor=floor,
+        floor_seen=floor is not None,
         upright=upright,
         first=first,
         chunks=len(chunks),
         posed=store.frames.posed_count(_POSED),
         space=spaces.pop() if len(spaces) == 1 else "",
-        stamp=_stamp(store, s),
+        rules=_rules(store, s),
+        T_world_graph=store.facts.S_world_graph,
         edits=last_edit(store),
     )
 
@@ -185,8 +190,14 @@ def known_world(store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) 
     world = store.facts[WORLD]
     if world is None:
         return None
-    now = (_upright(store), min(c.component for c in chunks), store.frames.posed_count(_POSED), _stamp(store, s))
-    return world if (world.upright, world.first, world.posed, world.stamp) == now else None
+    same = _same_frame(world.T_world_graph, store.facts.S_world_graph)
+    return world if same and obeys(world, store, chunks, s) else None
+
+
+def obeys(world: World, store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) -> bool:
+    """Return whether the library was derived by the rules that hold now, in whatever frame of the world."""
+    now = (_upright(store), min(c.component for c in chunks), store.frames.posed_count(_POSED), _rules(store, s))
+    return (world.upright, world.first, world.posed, world.rules) == now
 
 
 def _upright(store: Store) -> bool:
@@ -216,8 +227,13 @@ def _by_cameras(store: Store, inside: list[ChunkRow], floor: float | None, unit:
     return unit * math.exp(more / (1.0 + (_CAMERA_SPREAD / _DEPTH_SPREAD) ** 2))
 
 
-def _stamp(store: Store, s: ConsolidationSettings) -> int:
-    return zlib.crc32(repr((s, store.facts.S_world_graph, store.facts.scale_kind)).encode())
+def _rules(store: Store, s: ConsolidationSettings) -> int:
+    return zlib.crc32(repr((s, store.facts.scale_kind)).encode())
+
+
+def _same_frame(a: Sim3, b: Sim3) -> bool:
+    """Return whether two frames of the world are one, but for what writing them down rounds."""
+    return bool(np.allclose(a.as_matrix(), b.as_matrix(), rtol=0.0, atol=1e-9))
 
 
 def last_edit(store: Store) -> int:

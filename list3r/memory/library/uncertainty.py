@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from list3r.memory.geometry import Array, skew
+from list3r.memory.geometry import Array, Sim3, skew
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChunkRow
@@ -105,3 +106,27 @@ def position_sigma(center_world: Array, chunks: Iterable[ChunkRow]) -> float | N
     if not known:
         return None
     return float(max(np.sqrt(max(float(np.linalg.eigvalsh((C + C.T) / 2.0)[-1]), 0.0)) for C in known))
+
+
+def position_sigmas(
+    centers_world: Array, owner: NDArray[np.int64], seen_in: NDArray[np.int64], chunks: Sequence[ChunkRow]
+) -> list[float | None]:
+    """Return `position_sigma` of N instances at centres (N, 3); `owner`, (O,), are seen in the chunks `seen_in`."""
+    known = np.array([c.covariance is not None for c in chunks], bool)
+    owner, seen_in = owner[known[seen_in]], seen_in[known[seen_in]]
+    out: list[float | None] = [None] * len(centers_world)
+    if not len(owner):
+        return out
+    unknown = np.zeros((7, 7))
+    covariance = np.array([unknown if c.covariance is None else c.covariance for c in chunks])[seen_in]
+    scale = np.array([float(c.S_world_chunk.scale) for c in chunks])[seen_in]
+    rotation = np.array([c.S_world_chunk.rotation for c in chunks])[seen_in]
+    origin = np.array([c.S_world_chunk.translation for c in chunks])[seen_in]
+    p = Sim3(scale, rotation, origin).inverse().apply(centers_world[owner][:, None])[:, 0]
+    moves = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -skew(p), p[..., None]], axis=2)
+    moves = scale[:, None, None] * (rotation @ moves)
+    found = moves @ covariance @ np.swapaxes(moves, 1, 2)
+    most = np.linalg.eigvalsh((found + np.swapaxes(found, 1, 2)) / 2.0)[:, -1]
+    worst = np.full(len(centers_world), -1.0)
+    np.maximum.at(worst, owner, np.sqrt(np.maximum(most, 0.0)))
+    return [None if value < 0.0 else value for value in worst.tolist()]

@@ -21,8 +21,9 @@ from list3r.memory.records import Observation
 from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.relations.predicates import relations
 from list3r.memory.relations.scene import PairMeasures
-from list3r.memory.relations.structure import classify_structure, flagged_only
+from list3r.memory.relations.structure import classify_structure, flagged_only, is_level
 from list3r.memory.store.tables.library import Anchor, GroupMember
+from list3r.memory.world.floor import floor_near
 
 _SLACK_M = 0.05
 """Boxes in the R*Tree are rounded and lie where the chunks lie to the last digit."""
@@ -194,16 +195,15 @@ class Writer:
             return flagged_only([geometry])[0]
         near = [b for b in self._stored(self._near(geometry.aabb, reach)) if b.component == geometry.component]
         still = [b for b in near if not self._derived[b.id].dynamic]
-        world = self._world
-        return classify_structure([geometry], world.floor, self._eye_level, world.unit, self._s.structure, still)[0]
-
-    def _eye_level(self, geometry: InstanceGeometry) -> float:
-        """Return the height that 90 % of the cameras that saw an instance lie below; without cameras everything is
-        below.
-        """
+        world, s = self._world, self._s.structure
         rows = [self._region.settled_chunk(k) for k in dict.fromkeys(k for k, _ in self._group_of(geometry.id))]
-        heights = cameras_of(self._store, rows).translation[:, 2]
-        return float(np.quantile(heights, self._s.structure.eye_level)) if len(heights) else np.inf
+        cameras = cameras_of(self._store, rows).translation
+        eyes = float(np.quantile(cameras[:, 2], s.eye_level)) if len(cameras) else np.inf
+        floor = None
+        if world.floor_seen and is_level(geometry, s):
+            low = replace(self._s.gravity, floor_low_cameras=s.low_cameras)
+            floor = floor_near(still, cameras, world.unit, low)
+        return classify_structure([geometry], floor, lambda _: eyes, world.unit, s, still)[0]
 
     def relate(self, touched: Mapping[int, Array]) -> None:
         """Find the relations of what changed and of what is near it again, among all that is near those.

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 class MemoryEdits:
-    """What an operator can put right. Edits are kept with their author and hold for all that is added later."""
+    """The edits of an operator. The memory keeps each with its author, and obeys it in all later sessions."""
 
     store: Store
     _lock: AbstractContextManager[Any]
-    """Threads take turns."""
+    """Lets one thread in at a time."""
 
     def merge(self, a: int, b: int, *, author: str | None = None) -> EditReport:
         """Say that two instances are one; the older id stays, the other becomes its alias for ever."""
@@ -31,8 +31,8 @@ class MemoryEdits:
     def split(
         self, instance_id: int, out: Sequence[tuple[int, int]] | None = None, *, author: str | None = None
     ) -> EditReport:
-        """Say that an instance is two: `out` (chunk id, local id) leaves it, or what the evidence parts from it
-        best."""
+        """Say that an instance is two. The local instances `out` (chunk id, local id) leave it; by default those that
+        the evidence separates best."""
         from list3r.memory.maintenance import edits
 
         with self._lock:
@@ -46,28 +46,28 @@ class MemoryEdits:
             return edits.label(self._writable(), instance_id, text, author)
 
     def delete(self, instance_id: int, *, author: str | None = None) -> EditReport:
-        """Take an instance out, with all that is seen of it later."""
+        """Remove an instance, also from later sessions."""
         from list3r.memory.maintenance import edits
 
         with self._lock:
             return edits.delete(self._writable(), instance_id, author)
 
     def scale(self, anchor: str, *, author: str | None = None) -> EditReport:
-        """Say how long something is, like `12=0.095m` or `camera_height=1.5m`; lengths are metres from then on."""
+        """Give a known length, like `12=0.095m` or `camera_height=1.5m`; lengths are metres from then on."""
         from list3r.memory.maintenance import edits
 
         with self._lock:
             return edits.scale(self._writable(), anchor, author)
 
     def undo(self, entry: int | None = None, *, author: str | None = None) -> EditReport:
-        """Take back an edit or a decision of the merge log by its entry; without one, the last edit that stands."""
+        """Undo an edit or a decision of the merge log by its entry; by default the last edit that is not undone."""
         from list3r.memory.maintenance import edits
 
         with self._lock:
             return edits.undo(self._writable(), entry, author)
 
     def merges(self, instance_id: int | None = None) -> list[LogEntry]:
-        """Return the merge log, oldest first; only what concerns one instance where asked. Raises `UnknownIdError`."""
+        """Return the merge log, oldest first, or only the entries of one instance. Raises `UnknownIdError`."""
         from list3r.memory.maintenance.merge_log import merge_log
 
         with self._lock:

@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 
-from list3r.memory.constraints import Edit, Key, standing
+from list3r.memory.constraints import Edit, Key, key_name, standing
 from list3r.memory.errors import OptionError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
@@ -85,7 +85,7 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
         leaving = _checked_part(known, keys, out) if out is not None else propose_split(store, keys)
         staying = tuple(k for k in keys if k not in set(leaving))
         edit = _edit("split", (staying, tuple(sorted(leaving))), before, author)
-        told = ", ".join(map(_name, edit.parts[1]))
+        told = ", ".join(map(key_name, edit.parts[1]))
         return _carry_out(store, edit, (f"#{known}", told), f"{edit.author} split #{known}: {told} left it")
 
 
@@ -169,7 +169,7 @@ def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
     before = _owners(store, [a, b])
     one = len(before) == 1 and len(before[0][2]) > 0 and {a, b} <= set(before[0][2])
     if one != (d.kind == "merge"):
-        raise OptionError(f"entry {entry} does not hold any more: {d.a} and {d.b} are {'one' if one else 'two'} now")
+        raise OptionError(f"entry {entry} no longer applies: {d.a} and {d.b} are {'one' if one else 'two'} now")
     edit = replace(_edit("split" if one else "merge", ((a,), (b,)), before, author), target=entry)
     reason = f"{edit.author} took back the {d.kind} of entry {entry}"
     return _carry_out(store, edit, (d.a, d.b), reason)
@@ -287,7 +287,7 @@ def _check_effect(edit: Edit, home: Mapping[Key, int]) -> None:
     if edit.kind in ("merge", "split"):
         left, right = ({home[k] for k in part if k in home} for part in edit.parts)
         if left and right and (left == right) != (edit.kind == "merge"):
-            raise OptionError(f"the {edit.kind} does not come about: what was seen moving says otherwise")
+            raise OptionError(f"the {edit.kind} has no effect: what was seen moving contradicts it")
 
 
 def _retired(
@@ -307,13 +307,8 @@ def _retired(
 def _checked_part(instance_id: int, keys: Sequence[Key], out: Sequence[Key]) -> tuple[Key, ...]:
     wrong = [k for k in out if k not in keys]
     if wrong:
-        raise OptionError(
-            f"{_name(wrong[0])} is not a part of #{instance_id}; `list3r show MEMORY {instance_id} --json` lists them"
-        )
+        known = f"`list3r show MEMORY {instance_id} --json` lists them"
+        raise OptionError(f"{key_name(wrong[0])} is not a part of #{instance_id}; {known}")
     if not out or set(out) == set(keys):
-        raise OptionError(f"a part of #{instance_id} must leave and a part must stay; it has {len(keys)} in all")
+        raise OptionError(f"a part of #{instance_id} must leave and a part must stay; it has {len(keys)} parts")
     return tuple(sorted(set(out)))
-
-
-def _name(key: Key) -> str:
-    return f"{key[0]}:{key[1]}"

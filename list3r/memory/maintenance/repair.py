@@ -184,7 +184,7 @@ def _connect(path: Path, copy: Path, lost: _Lost) -> sqlite3.Connection:
     except (*FAILURES, MemoryFileError) as error:
         database.close()
         raise MemoryFileError(
-            f"{path} cannot be repaired: what says which tables it holds is damaged ({error}); use a backup"
+            f"{path} cannot be repaired: its table of contents is damaged ({error}); use a backup"
         ) from error
     return database
 

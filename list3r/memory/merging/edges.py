@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.constraints import ConstraintCheck, Constraints
-from list3r.memory.geometry import Array, Sim3
+from list3r.memory.constraints import ConstraintCheck, Constraints, key_name
+from list3r.memory.geometry import Array
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.merging.settings import MergeSettings
-from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou, joined, pair_scores, score_all
-from list3r.memory.overlap.voxels import ChunkShapes, Ints
+from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou, joined, pair_scores
+from list3r.memory.overlap.voxels import Ints
 from list3r.memory.records import MergeDecision
 
 __all__ = [
@@ -24,7 +24,6 @@ __all__ = [
     "box_iou",
     "form_groups",
     "links_of",
-    "merge_nodes",
     "pair_scores",
 ]
 
@@ -92,36 +91,6 @@ class Links:
         return {name: round(float(values[n]), 3) for name, values in names.items()}
 
 
-def merge_nodes(
-    chunks: Sequence[ChunkShapes],
-    S_world_chunk: Mapping[int, Sim3],
-    cannot_link: Sequence[tuple[Key, Key]],
-    settings: MergeSettings | None = None,
-    pairs: Mapping[tuple[int, int], PairScores] | None = None,
-    constraints: Constraints | None = None,
-) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """Group local instances into instances.
-
-    All chunks given must share one frame of reference. `pairs` are scores already known, by chunk ids (u <= v). The
-    partition is the same in whatever order chunks and pairs are given: edges are taken best first, ties by key. Two
-    groups are joined unless a cannot-link pair would come together, or too many pairs across speak against it
-    (complete link), or the operator's `constraints` part them. What these link is joined afterwards, by
-    `Constraints.joined`, so that each half of it goes on attracting what looks like it. Returns the groups, each
-    sorted, ordered by their first member, and the decisions: one `merge` for each union, one `refuse` for each strong
-    edge that was not taken.
-    """
-    s = settings or MergeSettings()
-    chunks = sorted(chunks, key=lambda c: c.chunk_id)
-    tables = {c.chunk_id: Nodes.of([c], S_world_chunk) for c in chunks}
-    known = pairs if pairs is not None else score_all(chunks, S_world_chunk)
-    found = {
-        (u, v): links_of(tables[u], tables[v], p, s)
-        for (u, v), p in sorted(known.items())
-        if u in tables and v in tables
-    }
-    return form_groups(tables, found, None, cannot_link, s, constraints)
-
-
 def form_groups(
     tables: Mapping[int, Nodes],
     links: Mapping[tuple[int, int], Links],
@@ -130,10 +99,14 @@ def form_groups(
     settings: MergeSettings,
     constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """Return the same as `merge_nodes`, from links of pairs of chunks that are known; of a `region` only, where one is
-    given.
+    """Group local instances into instances; only those of a `region` where one is given.
 
-    `tables` are the local instances of each chunk.
+    `tables` are the local instances of each chunk, in one frame of reference; `links` are of pairs of chunks, u <= v.
+    The partition is the same in whatever order chunks and pairs are given: links are taken best first, ties by key. Two
+    groups are joined unless a cannot-link pair would come together, or too many pairs across speak against it (complete
+    link), or the operator's `constraints` part them. What these link is joined afterwards, by `Constraints.joined`, so
+    that each half of it goes on attracting what looks like it. Returns the groups, each sorted, ordered by their first
+    member, and the decisions: one `merge` for each union, one `refuse` for each strong link that was not taken.
     """
     if not tables:
         return [], []
@@ -260,7 +233,7 @@ def _join(
             continue
         against = "" if check is None else check.objection(t.keys[x], t.keys[y])
         against = against or _too_long(t, clusters, a, b, s) or _objection(t, clusters, a, b, overlaps, s)
-        names, scores = (_name(t.keys[x]), _name(t.keys[y])), links.scores_of(n)
+        names, scores = (key_name(t.keys[x]), key_name(t.keys[y])), links.scores_of(n)
         if against:
             refused.add((a, b))
             decisions.append(MergeDecision("refuse", *names, scores, against))
@@ -286,7 +259,7 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
     members = clusters.members[a], clusters.members[b]
     seen_apart = clusters.foes[a].intersection(members[1])
     if seen_apart:
-        return f"{_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
+        return f"{key_name(t.keys[min(seen_apart)])} was seen beside a member of the other in one frame"
     one, other = (np.array(ns)[t.truncated[ns] < s.min_truncated] for ns in members)
     left, right = (x.ravel() for x in np.meshgrid(one, other, indexing="ij"))
     whole = np.maximum(t.size[left], t.size[right]) < s.max_whole_m * np.maximum(t.unit[left], t.unit[right])
@@ -301,7 +274,3 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
     if apart.sum() > s.max_conflicts * len(compared):
         return f"{int(apart.sum())} of {len(compared)} pairs of whole views lie apart"
     return ""
-
-
-def _name(key: Key) -> str:
-    return f"{key[0]}:{key[1]}"

@@ -14,6 +14,7 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.constraints import key_name
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou
 from list3r.memory.overlap.voxels import ChunkShapes
@@ -127,7 +128,7 @@ def join_movers(
     for edge in _edges(nodes, scene):
         if sets.connected(edge.a, edge.b):
             continue
-        names = (_name(nodes[edge.a].keys[0]), _name(nodes[edge.b].keys[0]))
+        names = (key_name(nodes[edge.a].keys[0]), key_name(nodes[edge.b].keys[0]))
         left, right = sorted(sorted(sets.subset(n)) for n in (edge.a, edge.b))
         against = _objection([nodes[n] for n in left], [nodes[n] for n in right], enemies, scene)
         if against:
@@ -311,9 +312,5 @@ def _objection(left: Sequence[_Node], right: Sequence[_Node], enemies: set[froze
     for x, y in product(left, right):
         for a, b in product(x.keys, y.keys):
             if frozenset((a, b)) in enemies or scene.seen_apart(a, b):
-                return f"{_name(a)} and {_name(b)} were seen side by side in one frame"
+                return f"{key_name(a)} and {key_name(b)} were seen side by side in one frame"
     return ""
-
-
-def _name(key: Key) -> str:
-    return f"{key[0]}:{key[1]}"

@@ -32,7 +32,7 @@ def frames_beside(chunks: Mapping[int, ChunkShapes], pairs: Collection[tuple[int
 
 
 @dataclass(frozen=True)
-class LookSettings:
+class MissedSettings:
     """When another chunk has looked at the place of an instance and missed it."""
 
     least_frames: int = 8
@@ -53,7 +53,7 @@ def misses(
     group: Sequence[Key],
     chunks: Mapping[int, ChunkShapes],
     beside: Mapping[int, Mapping[int, Ints]],
-    settings: LookSettings,
+    settings: MissedSettings,
 ) -> bool:
     """Return whether another chunk looked at a group in the frames that they share, and found nothing like it."""
     s, seen = settings, set[int]()
@@ -83,7 +83,7 @@ def _mask_iou(mine: Ints, frames: Ints, other: ChunkShapes) -> float:
     return float((shared / np.maximum(len(mine) + area - shared, 1)).max())
 
 
-def bears_out(
+def pictures_confirm(
     inner: Key,
     outer: Key,
     chunks: Mapping[int, ChunkShapes],

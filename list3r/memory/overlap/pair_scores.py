@@ -50,16 +50,6 @@ def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3, grown: GrownCells |
     return PairScores(i, j, i_on_j[i, j], j_on_i[i, j], shared[i, j], iou[i, j])
 
 
-def score_all(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> dict[tuple[int, int], PairScores]:
-    """Return the scores of all pairs of chunks, by chunk ids (u <= v)."""
-    out, grown = {}, GrownCells()
-    for n, u in enumerate(chunks):
-        for v in chunks[n:]:
-            S_u_v = S_world_chunk[u.chunk_id].inverse() @ S_world_chunk[v.chunk_id]
-            out[(u.chunk_id, v.chunk_id)] = pair_scores(u, v, S_u_v, grown)
-    return out
-
-
 def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
     """For all pairs: frames in which both are seen, and the mean IoU of their boxes there. Shape (N_u, N_v) each."""
     shape = (len(u.local_id), len(v.local_id))

@@ -59,7 +59,7 @@ class DepthView:
 
 
 @dataclass(frozen=True)
-class Look:
+class PlaceVisibility:
     """What frames tell about a place."""
 
     verdict: str
@@ -98,7 +98,9 @@ def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> 
     ]
 
 
-def look(points: Array, views: Iterable[DepthView], settings: VisibilitySettings | None = None) -> Look:
+def place_visibility(
+    points: Array, views: Iterable[DepthView], settings: VisibilitySettings | None = None
+) -> PlaceVisibility:
     """Ask frames about surface points of one instance, world coordinates, shape (N, 3)."""
     s = settings or VisibilitySettings()
     told = []
@@ -107,7 +109,7 @@ def look(points: Array, views: Iterable[DepthView], settings: VisibilitySettings
         if there + free >= max(s.least_points, s.least_share * len(points)):
             told.append((there + free, free, (view.session_id, view.frame_index)))
     if not told:
-        return Look("unseen", 0.0, ())
+        return PlaceVisibility("unseen", 0.0, ())
     shares = np.array([f / n for n, f, _ in told])
     share = float(np.median(shares))
     gone = shares >= s.gone
@@ -118,14 +120,14 @@ def look(points: Array, views: Iterable[DepthView], settings: VisibilitySettings
     else:
         verdict, kept = "unclear", np.ones(len(told), bool)
     best = sorted((t for t, k in zip(told, kept, strict=True) if k), key=lambda t: (-t[0], t[2]))
-    return Look(verdict, share, tuple(t[2] for t in best))
+    return PlaceVisibility(verdict, share, tuple(t[2] for t in best))
 
 
 UNTOLD, MET, FREE = 0, 1, 2
 """What a frame tells about one point: nothing, a surface where it should be, free space through it."""
 
 
-def tell(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.int8]:
+def point_visibility(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.int8]:
     """Return what one frame tells about each point of a surface, world coordinates. Shapes (N, 3) -> (N,)."""
     out = np.zeros(len(points), np.int8)
     p = view.S_cam_world.apply(points)
@@ -161,7 +163,7 @@ def tally(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> t
     """Return how many frames see through each point of a surface, and how many see it. Shapes (N,), (N,)."""
     free, met = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
-        told = tell(points, view, s)
+        told = point_visibility(points, view, s)
         free += told == FREE
         met += told == MET
     return free, met
@@ -178,5 +180,5 @@ def seen_through_share(points: Array, views: Iterable[DepthView], s: VisibilityS
 
 def _told(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
     """Return how many points of a surface one frame sees where they should be, and through how many it sees further."""
-    told = tell(points, view, s)
+    told = point_visibility(points, view, s)
     return int((told == MET).sum()), int((told == FREE).sum())

@@ -95,8 +95,6 @@ class ChunkShapes:
     """Middle of the trimmed extents. Shape (N, 3)."""
     size: Array
     """Diagonal of the trimmed extents, chunk units. Shape (N,)."""
-    cell_count: Ints
-    """Occupied cells of the instance's own grid. Shape (N,)."""
     plane: Array
     """(n, d), NaN for what is not flat. Shape (N, 4)."""
     truncated: Array
@@ -161,7 +159,7 @@ class ChunkShapes:
 
 
 _ROWS = (
-    *("local_id", "level", "center", "size", "cell_count", "plane", "truncated", "lab"),
+    *("local_id", "level", "center", "size", "plane", "truncated", "lab"),
     *("structure", "stability", "feature"),
 )
 _LISTS = ("frames", "boxes_xyxy", "areas_px", "visible_fraction")
@@ -215,7 +213,6 @@ def chunk_shapes(
         unit=unit,
         center=center,
         size=size,
-        cell_count=count,
         plane=np.array([np.full(4, np.nan) if n.plane is None else n.plane for n in nodes]).reshape(-1, 4),
         truncated=np.array([_truncated(n, seen, s.border_px) for n in nodes]),
         lab=np.array(

@@ -43,6 +43,9 @@ class StructureSettings:
     """Share of the points near a ceiling that may lie above it."""
     trim: float = 0.1
     """Share of the points at either side of a surface that noise may misplace, as its thickness is measured."""
+    low_cameras: float = 0.25
+    """Share of the cameras that saw a floor that may come as near to it as to a table: fewer saw one place than all, so
+    that a person who squats there weighs more."""
     eye_level: float = 0.9
     """Share of the cameras that lie below eye level."""
     above_eyes_m: float = 0.2
@@ -65,13 +68,13 @@ def classify_structure(
 ) -> list[str | None]:
     """floor, ceiling, wall, plane or None for each instance; z must be up.
 
-    `floor_height` is the z of the floor, None where it was not seen; `eye_level` gives the height of the cameras that
-    saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level, lies at the
-    floor, and is no rug, which chunks told from a floor that is seen beside it; a ceiling is level, above the cameras,
-    and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. What the chunks flagged in
-    the main and is none of these is `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet front stands
-    in the room and is no structure. What lies near an instance decides, so `around` may be all instances (the default:
-    those given) or those within `near_m`.
+    `floor_height` is the z of the floor at that place, None where it was not seen; `eye_level` gives the height of the
+    cameras that saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level,
+    lies at the floor, and is no rug, which chunks told from a floor that is seen beside it; a ceiling is level, above
+    the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. What the chunks
+    flagged in the main and is none of these is `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet
+    front stands in the room and is no structure. What lies near an instance decides, so `around` may be all instances
+    (the default: those given) or those within `near_m`.
     """
     s = settings or StructureSettings()
     known = instances if around is None else around
@@ -125,7 +128,7 @@ def _classify(
     thickness = float(np.ptp(np.quantile(along, [s.trim, 1.0 - s.trim])))
     edges = np.sort(instance.box.size)
     height, most = float(np.median(instance.points[:, 2])), max(s.thickness_m * unit, s.thickness * edges[1])
-    level = _level(instance, s)
+    level = is_level(instance, s)
     low = floor_height is not None and _low(instance, floor_height, unit, s)
     most = max(most, s.floor_band_m * unit) if low else most
     if thickness > most or edges[1] * edges[2] < s.min_area_m2 * unit**2:
@@ -147,14 +150,15 @@ def _classify(
     return None
 
 
-def _level(instance: InstanceGeometry, s: StructureSettings) -> bool:
+def is_level(instance: InstanceGeometry, s: StructureSettings) -> bool:
+    """Return whether an instance is a level surface; z must be up."""
     return instance.normal is not None and bool(abs(instance.normal[2]) > np.cos(np.radians(s.level_deg)))
 
 
 def _low(instance: InstanceGeometry, floor_height: float, unit: float, s: StructureSettings) -> bool:
     """Return whether a surface is level and lies at the floor."""
     away = abs(float(np.median(instance.points[:, 2])) - floor_height)
-    return _level(instance, s) and away < s.floor_band_m * unit
+    return is_level(instance, s) and away < s.floor_band_m * unit
 
 
 def _bounds(instance: InstanceGeometry, cloud: Array, unit: float, s: StructureSettings) -> bool:

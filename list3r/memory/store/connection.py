@@ -220,7 +220,7 @@ class Connection:
                 self._roll_back()
                 raise MemoryFileError(explained(self.path, error)) from error
             except UnicodeEncodeError as error:  # a name of a file may hold any bytes
-                raise OptionError(f"{str(error.object)[:200]} is no text of UTF-8; name it otherwise") from error
+                raise OptionError(f"{str(error.object)[:200]} is not valid UTF-8; rename it") from error
             finally:
                 self._writing = False
 

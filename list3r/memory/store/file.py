@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import sqlite3
@@ -107,7 +108,7 @@ def identified(path: Path, database: sqlite3.Connection) -> int:
             f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
         )
     if version < 1:
-        raise MemoryFileError(f"{path} has schema version {version}, which there never was; the file is damaged")
+        raise MemoryFileError(f"{path} has schema version {version}, which never existed; the file is damaged")
     check_schema(path, database, version)
     return version
 
@@ -116,7 +117,7 @@ def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None
     """Raise `MemoryFileError` when the file holds anything else than its schema: tables, triggers, views, indices."""
     expected, found = expected_schema(version), read_schema(database)
     for kind, name in sorted(found.keys() - expected.keys()):
-        raise MemoryFileError(f"{path} holds a {kind} {name!r}, which no memory has; it is not opened")
+        raise MemoryFileError(f"{path} holds a {kind} {name!r}, which no memory has; it was not opened")
     for kind, name in sorted(expected.keys()):
         if found.get((kind, name)) != expected[kind, name]:
             state = "is not the one of" if (kind, name) in found else "is missing for"
@@ -195,7 +196,7 @@ def use_write_ahead_log(path: Path, database: sqlite3.Connection) -> None:
                 raise
             if time.monotonic() > end:
                 raise MemoryFileError(
-                    f"{path} is being read by {_readers(path.resolve())} and cannot be written until that lets go of it"
+                    f"{path} is being read by {_readers(path.resolve())} and cannot be written until it is closed there"
                 ) from error
             time.sleep(_DRAIN_S)
     database.execute(f"PRAGMA busy_timeout={round(1000 * _WAIT_S)}").fetchall()
@@ -267,7 +268,7 @@ def check_beside(path: Path) -> None:
                 head = file.read(len(starts[0]))
                 ours = not head or head in starts  # a writer may have emptied it since
         if not ours:
-            raise MemoryFileError(f"{beside} has the name that {path.name} needs while it is written; move it away")
+            raise MemoryFileError(f"{beside} has a name that {path.name} needs while it is written; move it away")
 
 
 def not_alone(path: Path, database: sqlite3.Connection) -> str | None:
@@ -339,3 +340,9 @@ def migrate(database: sqlite3.Connection, version: int) -> None:
         if database.in_transaction:
             database.execute("ROLLBACK")
         raise
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -191,6 +191,15 @@ MIGRATIONS: tuple[str, ...] = (
     """
     ALTER TABLE local_instances ADD COLUMN scrap INTEGER NOT NULL DEFAULT 0;
     """,
+    # 11: how far chunks were carried since the library was derived; the floor is told where it is seen
+    """
+    ALTER TABLE settled ADD COLUMN carried BLOB NOT NULL
+        DEFAULT X'0000000000000000000000000000000000000000000000000000000000000000';
+    UPDATE memory SET value = json_set(json_remove(value, '$.floor', '$.stamp'), '$.rules', 0,
+        '$.floor_seen', json(iif(json_extract(value, '$.floor') IS NULL, 'false', 'true')),
+        '$.T_world_graph', json('[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]'))
+    WHERE key = 'library' AND json_valid(value);
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -60,12 +60,6 @@ class Gravity:
     """known, estimated or unknown."""
     up: Array
     """Unit vector; the cameras' mean up where unknown. Shape (3,)."""
-    spread_deg: float
-    """RMS angle of the level and upright planes about `up`; infinite without planes."""
-    camera_tilt_deg: float
-    """Between `up` and the mean up of the cameras."""
-    level_area: float
-    """Area of the level planes that agree, square units."""
     floor_height: float | None
     """Of the floor along `up`, from the origin of the frame; None where no floor was seen."""
     reason: str
@@ -87,11 +81,11 @@ def gravity_from_planes(
     """
     s = settings or GravitySettings()
     if len(S_graph_cam.rotation) == 0:
-        return Gravity("unknown", np.array([0.0, 0.0, 1.0]), np.inf, 0.0, 0.0, None, "no camera was placed")
+        return Gravity("unknown", np.array([0.0, 0.0, 1.0]), None, "no camera was placed")
     camera_up = -S_graph_cam.rotation[:, :, 1]
     mean_up = camera_up.mean(axis=0)
     mean_up /= max(float(np.linalg.norm(mean_up)), 1e-12)
-    unknown = Gravity("unknown", mean_up, np.inf, 0.0, 0.0, None, "no level surface agrees with the cameras")
+    unknown = Gravity("unknown", mean_up, None, "no level surface agrees with the cameras")
     big = planes.area >= s.plane_area_m2 * unit**2
     normals, areas = planes.normal[big], planes.area[big]
     candidates = normals[_camera_allows(normals, S_graph_cam, mean_up, s)]
@@ -107,14 +101,13 @@ def gravity_from_planes(
     agree = level | upright
     weight = np.sqrt(areas[agree])
     spread = float(np.degrees(np.sqrt((weight * off[agree] ** 2).sum() / weight.sum()))) if agree.any() else np.inf
-    tilt = float(np.degrees(np.arccos(np.clip(up @ mean_up, -1, 1))))
     level_area = float(areas[level].sum())
     enough = level_area >= s.min_level_area_m2 * unit**2 and spread <= s.max_spread_deg
     if not enough or not _camera_allows(up[None], S_graph_cam, mean_up, s)[0]:
-        return Gravity("unknown", up, spread, tilt, level_area, None, unknown.reason)
+        return Gravity("unknown", up, None, unknown.reason)
     floor = floor_height(up, planes, S_graph_cam.translation, unit, s)
     reason = f"{int(level.sum())} level and {int(upright.sum())} upright planes agree within {spread:.1f} degrees"
-    return Gravity("estimated", up, spread, tilt, level_area, floor, reason)
+    return Gravity("estimated", up, floor, reason)
 
 
 def _camera_allows(up: Array, S_graph_cam: Sim3, mean_up: Array, s: GravitySettings) -> Array:
@@ -207,7 +200,7 @@ def estimate_gravity(
         S_graph_chunk = {c.chunk_id: c.S_world_chunk for c in chunks}
         components = {c.chunk_id: c.component for c in chunks}
     if not chunks:
-        return Gravity("unknown", np.array([0.0, 0.0, 1.0]), np.inf, 0.0, 0.0, None, "the memory is empty")
+        return Gravity("unknown", np.array([0.0, 0.0, 1.0]), None, "the memory is empty")
     component = min(components[k] for k in S_graph_chunk)
     summaries = chunk_summaries(store)
     rows = sample_of([c for c in chunks if components[c.chunk_id] == component])
@@ -229,12 +222,9 @@ def estimate_gravity(
 
 def _stated(up: Array, planes: Planes, S_graph_cam: Sim3, unit: float, s: GravitySettings) -> Gravity:
     """Return up as a recorder states it, with the floor that planes show."""
-    mean_up = -S_graph_cam.rotation[:, :, 1].mean(axis=0) if len(S_graph_cam.rotation) else up
-    cosine = float(up @ mean_up / max(float(np.linalg.norm(mean_up)), 1e-12))
-    tilt = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     known = len(planes.normal) > 0 and len(S_graph_cam.rotation) > 0
     floor = floor_height(up, planes, S_graph_cam.translation, unit, s) if known else None
-    return Gravity("known", up, 0.0, tilt, 0.0, floor, "the recorder of the source knew gravity")
+    return Gravity("known", up, floor, "the recorder of the source knew gravity")
 
 
 def _with_hysteresis(found: Gravity, before: UpEstimate | None, unit: float, s: GravitySettings) -> Gravity:

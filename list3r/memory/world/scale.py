@@ -93,7 +93,7 @@ def measure(store: Store, anchor: ScaleAnchor) -> MeasuredAnchor:
     """Return how long the anchor is now. Raises `OptionError` and `UnknownIdError` where it cannot be measured."""
     chunks = _main_part(store.chunks.all())
     if not chunks:
-        raise OptionError(f"{store.path} holds no chunk yet; there is nothing to measure")
+        raise OptionError(f"{store.path} has no chunk yet; there is nothing to measure")
     if store.facts.scale_kind == "metric":
         raise OptionError(f"lengths of {store.path} are metres already ({store.facts.scale_source})")
     length, keys = _length(store, anchor, chunks)
@@ -171,9 +171,7 @@ def _length(store: Store, anchor: ScaleAnchor, chunks: list[ChunkRow]) -> tuple[
     if anchor.kind == "camera":
         estimate = store.facts.gravity_estimate
         if not upright or estimate is None or estimate.floor_height is None:
-            raise OptionError(
-                f"{store.path} knows no floor to measure camera_height from; anchor an instance by its ID"
-            )
+            raise OptionError(f"{store.path} has no floor to measure camera_height from; anchor an instance by its ID")
         return float(np.median(cameras_of(store, chunks).translation[:, 2])), ()
     instance = store.instances.get(store.ids.resolve(anchor.instance_id))
     if instance.component != chunks[0].component:
@@ -185,7 +183,7 @@ def _length(store: Store, anchor: ScaleAnchor, chunks: list[ChunkRow]) -> tuple[
     if anchor.kind == "size":
         return float(instance.box.size.max()), keys
     if not upright:
-        raise OptionError(f"{store.path} does not know which way is up; anchor #{instance.id} by its longest edge")
+        raise OptionError(f"{store.path} has no known up direction; anchor #{instance.id} by its longest edge")
     return float(instance.aabb[1, 2] - instance.aabb[0, 2]), keys
 
 

@@ -37,7 +37,7 @@ def with_camera(
     if before.camera is None:
         with store.transaction():
             store.sessions.put(replace(before, camera=known))
-    return told_camera(options, known)
+    return stated_camera(options, known)
 
 
 def estimated_camera(
@@ -80,7 +80,7 @@ def with_short_windows(settings: BuildSettings) -> BuildSettings:
     return replace(settings, models=replace(settings.models, sfm=sfm))
 
 
-def told_camera(options: SourceOptions, known: SessionCamera) -> SourceOptions:
+def stated_camera(options: SourceOptions, known: SessionCamera) -> SourceOptions:
     """The options with a camera that was estimated."""
     return replace(options, intrinsics=known.intrinsics, distortion=known.distortion)
 

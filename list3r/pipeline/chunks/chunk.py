@@ -28,7 +28,7 @@ from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
-from list3r.models.device import memory_said
+from list3r.models.device import out_of_memory_reported
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
@@ -54,18 +54,12 @@ class ChunkTask:
     """By Frame.index, where the whole video was mapped before its chunks."""
 
 
-def process_chunk(task: ChunkTask, discoverer: Discoverer | None = None) -> ChunkResult:
-    """Frames of one chunk to poses, keyframes and a local instance library; the last part of one that falls apart.
-
-    A `discoverer` stands in for the one that the settings name.
-    """
-    return process_parts(task, discoverer)[-1]
-
-
 def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tuple[ChunkResult, ...]:
-    """As `process_chunk`, but all parts of a chunk through which the camera could not be followed, in order of time.
+    """Turn the frames of one chunk into poses, keyframes and local instances.
 
-    The last part has the number of the span, so that the span is done when that part is stored.
+    A chunk through which the camera could not be followed falls into several parts, in order of time. The last part
+    has the number of the span, so that the span is done when that part is stored. A `discoverer` stands in for the one
+    that the settings name.
     """
     clock = _Clock()
     source = _source(task.path, task.options)
@@ -222,7 +216,7 @@ def _described(
     """What is found in a reconstruction, and what is kept of it."""
     s = task.settings
     named, tracker = _instance_models(s)
-    with memory_said("what finds and follows things"):
+    with out_of_memory_reported("what finds and follows things"):
         library = build_library(frames, reconstruction, s.instances, discoverer or named, tracker)
     clock.mark("instances")
     keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, _detector(s), library)

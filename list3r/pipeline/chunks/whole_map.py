@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import FrameSource
+from list3r.frames.base import FrameSource, index_at
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, even_chunks
 from list3r.memory.records import ChunkRow
 from list3r.pipeline.settings import BuildSettings
@@ -45,10 +45,5 @@ def map_spans(
         return list(usual)
     spans = even_chunks(source.info.frame_count, settings.video_map.chunks)
     last = {row.index: row.last_frame for row in begun}
-    longer = (last[s.index] > _index_at(source, s.stop - 1) for s in spans if s.index in last)
+    longer = (last[s.index] > index_at(source, s.stop - 1) for s in spans if s.index in last)
     return list(usual) if any(longer) else spans
-
-
-def _index_at(source: FrameSource, position: int) -> int:
-    """Return the number in the source of the frame at a position."""
-    return next((f.index for f in source.read(position, position + 1)), position)

@@ -77,12 +77,6 @@ def surface_of(store: Store, instance: Instance) -> InstanceSurface:
     return known.get(key) or known.put(key, _surface(store, instance))
 
 
-def surface_points(store: Store, instance: Instance) -> tuple[NDArray[np.float64], float]:
-    """Return surface points of an instance in the world, thinned out (N, 3), and how far they lie from each other."""
-    surface = surface_of(store, instance)
-    return surface.points, surface.spacing
-
-
 def _surface(store: Store, instance: Instance) -> InstanceSurface:
     """Return the support points inside the box, as deriving the box left strays out; those just outside are moved to
     its side, so that a thing is never nearer than its box.

@@ -28,7 +28,7 @@ def read_exr(path: Path) -> NDArray[np.float32]:
     try:
         return _read(read_file(path, _MOST_BYTES))
     except (ValueError, IndexError, struct.error, zlib.error, KeyError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path} is no depth image in OpenEXR of one channel: {str(error)[:120]}") from None
+        raise OptionError(f"{path} is not a depth image in OpenEXR of one channel: {str(error)[:120]}") from None
 
 
 def _read(data: bytes) -> NDArray[np.float32]:

@@ -27,7 +27,7 @@ def convert_predictions(path: Path, folder: Path, options: OutputOptions | None 
     reader = next((r for r in READERS if r.recognises(path)), None)
     if reader is None:
         known = "; ".join(r.name for r in READERS)
-        what = "is no output that is known" if path.exists() else "does not exist"
+        what = "is not a known output" if path.exists() else "does not exist"
         raise SourceError(f"{path} {what}; give {known}")
     if folder.exists():
         raise ExportError(f"{folder} exists; name another folder or remove it first")

@@ -61,7 +61,7 @@ def _poses(path: Path) -> Array:
     except ValueError:
         rows = np.zeros((0, 0))
     if rows.ndim != 2 or rows.shape[1:] != (16,) or not len(rows):
-        raise SourceError(f"{path} is no list of poses of 16 numbers each")
+        raise SourceError(f"{path} is not a list of poses of 16 numbers each")
     T = rows.reshape(-1, 4, 4)
     scale = np.cbrt(np.linalg.det(T[:, :3, :3]))
     T[:, :3, :3] /= np.where(np.abs(scale) > 1e-9, scale, np.nan)[:, None, None]

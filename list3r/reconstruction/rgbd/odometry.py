@@ -67,6 +67,7 @@ class CameraTracker:
         self._features: dict[int, Features] = {}
         self._views: dict[int, WorkingFrame] = {}
         self._moving: dict[int, Mask] = {}
+        self._unsure: set[int] = set()
         self._movers = MoverMemory(settings.movers, settings.noise)
         size = (self.small.width, self.small.height)
         self._known = {
@@ -141,8 +142,10 @@ class CameraTracker:
             self._keep_movers(segment, position, T_segment_cam)
         else:
             self._movers.mask = None
-        segment.model.fuse(self.view(position), T_segment_cam)
         segment.T_segment_cam[position] = T_segment_cam
+        if position in self._unsure:
+            return
+        segment.model.fuse(self.view(position), T_segment_cam)
         if not segment.keyframes or self._moved(segment, position):
             segment.keyframes.append(position)
 
@@ -192,11 +195,28 @@ class CameraTracker:
         else:
             found.append(self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s))
         possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
+        if given is not None and possible:
+            possible = [f for f in possible if self._believed(segment, given, f)]
+            if not possible:  # the stated step alone, of a frame that shows something else: not for the model
+                self._unsure.add(position)
         if not possible:
             return None if given is None else given.T_model_cam
         best = max(possible, key=lambda f: f.overlap * f.inliers)
         segment.usual_inliers = max(best.inliers, self.settings.forget * segment.usual_inliers)
         return best.T_model_cam
+
+    def _believed(self, segment: TrackedSegment, given: PosePrior, found: FrameRegistration) -> bool:
+        """Return whether a pose is near the stated step, or fits so well that the given poses must have jumped.
+
+        A blurred picture of a bare floor fits somewhere else, too, if badly (0153).
+        """
+        prior = self.settings.prior
+        off = np.linalg.inv(given.T_model_cam) @ found.T_model_cam
+        if np.linalg.norm(off[:3, 3]) <= prior.jump_m and angle_deg(off) <= prior.jump_deg:
+            return True
+        return bool(
+            found.inliers >= prior.jump_inliers * segment.usual_inliers and found.correlation >= prior.jump_correlation
+        )
 
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
         """Return whether much less agrees than did in the frames before, as in a false minimum."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera
+from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera, index_at
 from list3r.reconstruction.sfm.colmap import pycolmap
 from list3r.reconstruction.sfm.links import keyframe_problem
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, Poses, SparseMap, build_maps
@@ -126,7 +126,7 @@ def _estimated(source: FrameSource, start: Camera, sfm: SfmSettings, progress: P
         window = _window(source, a, b, start, sfm)
         if window is not None and _believable(window[1].camera, window[1].k1, settings):
             windows.append(window)
-            begins.append(_index_at(source, a))
+            begins.append(index_at(source, a))
         if progress is not None:
             progress(done, len(spans))
     if not windows:
@@ -153,11 +153,6 @@ def _agreeing(focals: NDArray[np.float64], settings: CameraCalibrationSettings) 
     near = np.abs(logs[:, None] - np.r_[np.median(logs), logs][None]) < np.log(settings.most_window_ratio)
     votes = near.sum(axis=0)
     return np.asarray(near[:, 0 if 2 * votes[0] >= len(logs) else 1 + int(np.argmax(votes[1:]))])
-
-
-def _index_at(source: FrameSource, position: int) -> int:
-    """Return the number in the source of the frame at a position."""
-    return next((f.index for f in source.read(position, position + 1)), position)
 
 
 def _parted(found: _Estimate, stored_px: float, settings: CameraCalibrationSettings) -> tuple[str, ...]:

@@ -12,11 +12,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
+from list3r.frames.decoding.picture import gray_of
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
@@ -70,7 +70,7 @@ class SfmReconstructor:
 
         Raises `TrackingError` when the camera cannot be followed through any two frames, with the reason.
         """
-        grays = [_gray(f) for f in frames]
+        grays = [gray_of(f) for f in frames]
         return self._finish(frames, self._segments(frames, grays, camera)[0])
 
     def parts(
@@ -85,7 +85,7 @@ class SfmReconstructor:
         With `around` some frames before and behind the chunk are mapped with it. With `deep` only the frames of these
         numbers get depth, and the others a pose. Raises `TrackingError` as above.
         """
-        grays = [_gray(f) for f in frames]
+        grays = [gray_of(f) for f in frames]
         first, *others = self._segments(frames, grays, camera, around)
         others = [s for s in others if len(s.T_map_cam) >= self.settings.least_segment]
         elsewhere = {k for s in others for k in s.T_map_cam}
@@ -102,7 +102,7 @@ class SfmReconstructor:
         known = {k: T_map_cam[f.index] for k, f in enumerate(frames) if f.index in T_map_cam}
         if not known:
             raise TrackingError(f"{_span(frames)}: the map of the whole video does not hold them")
-        tracks = follow_corners([_gray(f) for f in frames], self.settings.tracks)
+        tracks = follow_corners([gray_of(f) for f in frames], self.settings.tracks)
         problem = corner_problem(tracks, self.settings.links)
         gate = self.settings.mapping.pose_error_px * pixel_unit(camera)
         verified = agreeing_rows(problem, camera, known, gate)
@@ -140,7 +140,7 @@ class SfmReconstructor:
         beside = [*before, *behind]
         early, late = np.split(len(frames) + np.arange(len(beside)), [len(before)])
         few = replace(s.links.features, count=s.links.ahead_features, learned_count=s.links.ahead_features)
-        seen, colors = [*grays, *map(_gray, beside)], [f.color for f in (*frames, *beside)]
+        seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         return build_maps(wider, camera, free_camera=free, settings=s.mapping)
@@ -201,10 +201,6 @@ class SfmReconstructor:
             depth_noise=stereo_noise(depth, confidence, self.settings.dense.trust),
             between=between,
         )
-
-
-def _gray(frame: Frame) -> Gray:
-    return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _renumbered(segment: PosedSegment, kept: Sequence[int]) -> PosedSegment:

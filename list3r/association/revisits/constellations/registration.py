@@ -26,7 +26,7 @@ from list3r.association.revisits.constellations.matching import (
 )
 from list3r.association.revisits.constellations.surface_fit import (
     ChunkSurfaces,
-    Held,
+    KnownRelation,
     SurfaceFit,
     SurfaceFitSettings,
     fit_surfaces,
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class BeliefWeights:
+class RelationOdds:
     """Log odds that a relation is right, fitted to 277 of them in 27 simulated homes (docs/decisions/0053)."""
 
     bias: float = -3.1
@@ -73,12 +73,12 @@ class ConstellationRegistrationSettings:
     believed_pairs: int = 4
     """Things that must still agree once surfaces were brought together, for a relation to be believed."""
     least_belief: float = 3.1
-    """Least log odds that a relation is right (`BeliefWeights`) for it to be believed."""
+    """Least log odds that a relation is right (`RelationOdds`) for it to be believed."""
     least_fitting: float = 0.1
     """Share of a chunk's surface that must meet the other's: with less a relation is loose."""
     most_rival: float = 0.9
     """Another relation of the same chunks must have less of the believed one's support than this."""
-    belief: BeliefWeights = field(default_factory=BeliefWeights)
+    belief: RelationOdds = field(default_factory=RelationOdds)
     place: float = 0.04
     """Deviation of a thing's middle once surfaces were brought together, share of the typical depth,"""
     most_off: float = 2.0
@@ -122,7 +122,7 @@ def register(
     likely = [m for m in matches if len(m.pairs) >= settings.least_pairs and m.score >= settings.least_match]
     for match in likely[: settings.tried]:
         S = _lowered(match.S_v_u, cu, cv)
-        held = Held(
+        held = KnownRelation(
             middle_u=cu.center[match.pairs[:, 0]] @ cu.R_up_chunk,
             middle_v=cv.center[match.pairs[:, 1]] @ cv.R_up_chunk,
             up_u=cu.R_up_chunk[2],
@@ -141,7 +141,7 @@ def register(
     return Registration(best.S_v_u, best.match, best.fit, scores)
 
 
-def belief(scores: Mapping[str, float], weights: BeliefWeights) -> float:
+def log_odds(scores: Mapping[str, float], weights: RelationOdds) -> float:
     """Return the log odds that a relation of these scores is right."""
     w = weights
     return (
@@ -155,11 +155,11 @@ def belief(scores: Mapping[str, float], weights: BeliefWeights) -> float:
     )
 
 
-def doubt(scores: Mapping[str, float], settings: ConstellationRegistrationSettings) -> str | None:
+def refusal(scores: Mapping[str, float], settings: ConstellationRegistrationSettings) -> str | None:
     """Return why a relation of these scores is not believed, or None."""
     if scores["agreeing"] < settings.believed_pairs:
         return f"with surfaces brought together only {scores['agreeing']:.0f} of them do"
-    if (odds := belief(scores, settings.belief)) < settings.least_belief:
+    if (odds := log_odds(scores, settings.belief)) < settings.least_belief:
         return f"too little speaks for it (log odds {odds:.1f}, wanted {settings.least_belief:.1f})"
     if scores["fitting"] < settings.least_fitting:
         return f"too little of the surfaces meets ({scores['fitting']:.0%})"

@@ -24,9 +24,9 @@ from list3r.association.revisits.constellations.registration import (
     ConstellationRegistrationSettings,
     RegisteredChunk,
     Registration,
-    belief,
     covariance,
-    doubt,
+    log_odds,
+    refusal,
     register,
 )
 from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
@@ -121,7 +121,7 @@ class ThingSearch:
             if found is not None:
                 way = ways.predict(u, self._id) if u in tied else None
                 off = None if way is None else way.deviations(found.S_v_u)
-                against = doubt(found.scores, s.registration)
+                against = refusal(found.scores, s.registration)
                 if against is None and off is not None and off > most_deviations:
                     against = f"the way between the chunks contradicts it by {off:.0f} deviations"
                 out.append(self._edge(u, old, new, found, against))
@@ -241,7 +241,7 @@ class ThingSearch:
             accepted=against is None,
             reason=f"{agree}; {against}" if against else f"{agree}, and surfaces with them",
             scores={f"things_{name}": value for name, value in found.scores.items()}
-            | {_BELIEF: belief(found.scores, self._settings.registration.belief)},
+            | {_BELIEF: log_odds(found.scores, self._settings.registration.belief)},
             frames=(self._middle_keyframe(u), self._middle_keyframe(self._id)),
             covariance=covariance(old, self._metric(u), self._settings.registration),
         )

@@ -40,7 +40,7 @@ class SurfaceFitSettings:
 
 
 @dataclass(frozen=True)
-class Held:
+class KnownRelation:
     """What is known of a relation besides surfaces."""
 
     middle_u: Array
@@ -99,7 +99,7 @@ def fit_surfaces(
     S_v_u: Sim3,
     u: ChunkSurfaces,
     v: ChunkSurfaces,
-    held: Held,
+    held: KnownRelation,
     metric: bool,
     settings: SurfaceFitSettings | None = None,
 ) -> SurfaceFit | None:
@@ -148,7 +148,7 @@ class _Fit:
     point_normals: Array
     """Shape (N, 3)."""
     v: ChunkSurfaces
-    held: Held
+    held: KnownRelation
     metric: bool
     settings: SurfaceFitSettings
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import FolderLayout, Optics, pose_matrix, read_json
+from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, pose_matrix, read_json, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit
@@ -27,6 +27,8 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     optimised = (base / "corrected_images").is_dir() and (base / "corrected_cameras").is_dir()
     images = base / ("corrected_images" if optimised else "images")
     cameras = base / ("corrected_cameras" if optimised else "cameras")
+    if base.is_dir() and images.is_dir() and not cameras.is_dir() and (root / "mesh_info.json").is_file():
+        raise SourceError(f"{root} is an export of Polycam without keyframes/cameras; is the copy complete?")
     if not (images.is_dir() and cameras.is_dir()):
         return None
     colors = sorted(images.glob("*.jpg"), key=lambda p: (len(p.stem), p.stem))
@@ -35,6 +37,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if not len(known):
         raise SourceError(f"{cameras} states the camera of no picture; is the copy complete?")
     fx, fy, cx, cy, width, height = np.median(known, axis=0).tolist()
+    spread = float(np.ptp(known[:, 0]) / fx) if fx > 0 and options.intrinsics is None else 0.0
     files = FrameFiles(
         FrameFile(
             color,
@@ -42,18 +45,19 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
             T_source_camera=pose,
             time_s=1e-6 * int(color.stem) if color.stem.isdigit() else None,
             confidence=_there(base / "confidence" / f"{color.stem}.png"),
+            lens=own_camera(stated, cameras) if stated is not None and spread > VARIES else None,
         )
-        for color, _, pose in rows
+        for color, stated, pose in rows
     )
     notes = ["cameras of Polycam" + (", optimised by it" if optimised else " as ARKit tracked them")]
+    if spread > VARIES:
+        notes.append(varies_note(spread, carried=True))
     try:
         intrinsics = options.intrinsics or check_intrinsics([fx, fy, cx, cy])
     except OptionError as error:
         raise SourceError(f"{cameras}: {error}") from None
     size = (round(height), round(width))
-    optics = Optics(intrinsics, (), intrinsics, np.eye(4), 1000.0, size, size)
-    if not any(f.depth for f in files):
-        optics = Optics(intrinsics, intrinsics_size=size)
+    optics = Optics(intrinsics, depth_scale=1000.0, intrinsics_size=size, shares_view=True)
     return FolderLayout(
         "polycam",
         files,
@@ -78,7 +82,7 @@ def _camera(path: Path) -> tuple[list[float] | None, NDArray[np.float64] | None]
         return None, None
     content = read_json(path)
     if not isinstance(content, dict):
-        raise SourceError(f"{path} is no camera of Polycam; mend or remove it")
+        raise SourceError(f"{path} is not a camera of Polycam; mend or remove it")
     try:
         stated = [float(content[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")]
         T_world_arkit = pose_matrix(float(content[f"t_{row}{column}"]) for row in range(3) for column in range(4))

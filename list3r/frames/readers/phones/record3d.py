@@ -19,8 +19,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.base import Camera
 from list3r.frames.files import MAX_TEXT_BYTES
-from list3r.frames.layout import FolderLayout, Optics, read_json
+from list3r.frames.layout import VARIES, FolderLayout, Optics, read_json, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
@@ -39,8 +40,6 @@ _AT_START = pose_of_arkit(np.eye(4))[:3, :3]
 _NOT_UPRIGHT = "poses begin at the first picture and do not say which way is up: floors and walls will"
 MOST_DEPTH_PIXELS = 2**20
 """Of one depth image; LiDAR has 192x256, the front camera up to 720x960."""
-VARIES = 0.01
-"""Focal lengths of frames that differ by a larger share are told of: one camera serves all frames."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +55,10 @@ class PhoneCamera:
     def of(cls, where: Path, content: Mapping[str, Any]) -> Self:
         """Return what the metadata of a recording state. Raises `SourceError`."""
         try:
-            k = [float(v) for v in content["K"]]
+            k = column_by_column([float(v) for v in content["K"]])
             size = int(content["h"]), int(content["w"])
             depth = (int(content["dh"]), int(content["dw"])) if "dw" in content else None
-            intrinsics = check_intrinsics([k[0], k[4], k[6], k[7]])  # column by column
+            intrinsics = check_intrinsics([k[0], k[4], k[6], k[7]])
         except (KeyError, TypeError, ValueError, IndexError, OptionError):
             raise SourceError(f"{where}: its metadata states no camera K with w and h; export it again") from None
         if min(size) < 1 or (depth is not None and not 0 < depth[0] * depth[1] <= MOST_DEPTH_PIXELS):
@@ -83,7 +82,7 @@ class PhoneCamera:
         """Return the layout of frames of this camera."""
         given = options.intrinsics or self.intrinsics
         if with_depth:
-            optics = Optics(given, (), self.intrinsics, np.eye(4), 1.0, self.size, self.size)
+            optics = Optics(given, depth_scale=1.0, intrinsics_size=self.size, shares_view=True)
         else:
             optics = Optics(given, intrinsics_size=self.size)
         up = first_pose is not None and not np.allclose(first_pose[:3, :3], _AT_START, rtol=0.0, atol=_LEAST_TURN)
@@ -130,7 +129,7 @@ def _layout(
     where: Path, content: object, present: set[str], stored: Callable[[str], Stored], options: SourceOptions
 ) -> FolderLayout:
     if not isinstance(content, dict):
-        raise SourceError(f"{where}: its metadata is no table; export it from Record3D again")
+        raise SourceError(f"{where}: its metadata is not a table; export it from Record3D again")
     named = (_PICTURE.fullmatch(name) for name in present)
     numbers = sorted(int(found[1]) for found in named if found)
     if not numbers:
@@ -138,6 +137,7 @@ def _layout(
     camera = PhoneCamera.of(where, content)
     poses, times = _poses(content), content.get("frameTimestamps")
     fps = content.get("fps")
+    spread, lenses = _lenses(content, camera) if options.intrinsics is None else (0.0, [])
     files, with_depth = [], False
     for k in numbers:
         depth, confidence = (
@@ -146,16 +146,21 @@ def _layout(
         )
         with_depth = with_depth or depth is not None
         pose = poses[k] if k < len(poses) else None
-        files.append(FrameFile(stored(f"rgbd/{k}.jpg"), depth, None, pose, _time(times, k, fps), confidence))
+        lens = lenses[k] if k < len(lenses) else None
+        time_s = _time(times, k, fps)
+        files.append(FrameFile(stored(f"rgbd/{k}.jpg"), depth, None, pose, time_s, confidence, lens=lens))
     notes = ["camera and poses of Record3D (ARKit)"]
-    spread = _focal_spread(content)
+    if column_by_column(content["K"]) != content["K"]:
+        notes.append("K of its metadata is written row by row, and read so")
     if spread > VARIES:
-        notes.append(f"focal lengths of frames differ by {100 * spread:.1f} %: one camera serves all of them")
-    lost = sum(p is None for p in poses) + max(0, len(numbers) - len(poses))
+        notes.append(varies_note(spread, carried=True))
+    gaps = numbers[-1] - numbers[0] + 1 - len(numbers)
+    if gaps:
+        notes.append(f"{gaps} of the pictures {numbers[0]} to {numbers[-1]} are not there; is the copy complete?")
     if _stands(content):
-        notes.append("every frame states the same pose, as of the front camera: poses are not used")
-    elif lost:
-        notes.append(f"{lost} of {len(numbers)} frames come without a pose")
+        finite = all(pose_of_row(row) is not None for row in content["poses"])
+        why = "every frame states the same pose, as of the front camera" if finite else "no frame states a pose"
+        notes.append(f"{why}: poses are not used")
     first = next((p for p in poses if p is not None), None)
     return camera.layout("record3d", files, first, with_depth, options, notes)
 
@@ -188,9 +193,25 @@ def _time(times: object, k: int, fps: object) -> float | None:
     return k / fps if isinstance(fps, int | float) and fps > 0 else None
 
 
-def _focal_spread(content: Mapping[str, Any]) -> float:
-    """By what share the focal lengths of frames differ, where they are stated one by one."""
+def column_by_column(k: Sequence[float]) -> list[float]:
+    """Return the nine numbers of a camera matrix column by column, also where they are written row by row."""
+    rows = len(k) == 9 and k[6] == k[7] == 0 and bool(k[2] or k[5])
+    return [k[3 * column + row] for row in range(3) for column in range(3)] if rows else list(k)
+
+
+def _lenses(content: Mapping[str, Any], camera: PhoneCamera) -> tuple[float, list[Camera | None]]:
+    """Return by what share the focal lengths of frames differ, and the frames' own cameras where that is much.
+
+    `perFrameIntrinsicCoeffs` has fx, fy, cx, cy of each frame; None for one that has no such numbers.
+    """
     rows = content.get("perFrameIntrinsicCoeffs")
-    rows = rows if isinstance(rows, list) else []
-    focal = [r[0] for r in rows if isinstance(r, list) and r and isinstance(r[0], int | float)]
-    return float(np.ptp(focal) / np.median(focal)) if focal and min(focal) > 0 else 0.0
+    height, width = camera.size
+    out: list[Camera | None] = []
+    for row in rows if isinstance(rows, list) else []:
+        try:
+            out.append(Camera(width, height, *check_intrinsics([float(v) for v in row[:4]])))
+        except (TypeError, ValueError, OptionError):
+            out.append(None)
+    focal = [lens.fx for lens in out if lens is not None]
+    spread = float(np.ptp(focal) / np.median(focal)) if focal else 0.0
+    return (spread, out) if spread > VARIES else (spread, [])

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import pose_matrix, read_json
+from list3r.frames.layout import VARIES, pose_matrix, read_json, varies_note
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.readers.video_depth import RecordingParts, VideoWithDepth
 from list3r.frames.recordings.stored import CodedArray, FileSlice
@@ -37,16 +37,21 @@ def open_scan(root: Path, options: SourceOptions) -> VideoWithDepth:
     base = root if (root / _TABLE).is_file() else root / "iphone"
     video = _video(base)
     assert video is not None
-    intrinsics, poses = _cameras(base / _TABLE)
+    stated, poses = _cameras(base / _TABLE)
+    fx, fy, cx, cy = np.median(list(stated.values()), axis=0).tolist()
+    spread = float(np.ptp([row[0] for row in stated.values()]) / fx)
+    carried = spread > VARIES and options.intrinsics is None and not options.distortion
+    note = f"cameras and poses of {_TABLE}, aligned to the laser scan"
     depth, units = _depth(base / _DEPTH) if (base / _DEPTH).is_file() else ({}, 1000.0)
     parts = RecordingParts(
         "scannetpp",
         video,
-        options.intrinsics or intrinsics,
+        options.intrinsics or (fx, fy, cx, cy),
         depth,
         poses,
         units,
-        f"cameras and poses of {_TABLE}, aligned to the laser scan",
+        f"{note}; {varies_note(spread, carried)}" if spread > VARIES else note,
+        lenses=stated if carried else {},
     )
     return VideoWithDepth(root, parts, options)
 
@@ -55,22 +60,25 @@ def _video(base: Path) -> Path | None:
     return next((base / n for n in ("rgb.mp4", "rgb.mkv") if (base / n).is_file()), None)
 
 
-def _cameras(path: Path) -> tuple[Intrinsics, dict[int, NDArray[np.float64]]]:
-    """The median camera, and poses by frame number. Raises `SourceError`."""
+def _cameras(path: Path) -> tuple[dict[int, Intrinsics], dict[int, NDArray[np.float64]]]:
+    """Cameras and poses by frame number. Raises `SourceError`."""
     content = read_json(path)
     rows = {int(m[1]): v for k, v in content.items() if (m := _NAME.fullmatch(k))} if isinstance(content, dict) else {}
     if not rows:
         raise SourceError(f"{path} names no frames frame_000000; is it of ScanNet++?")
     try:
-        stated = np.array([np.asarray(row["intrinsic"], np.float64).reshape(3, 3) for row in rows.values()])
+        stated = {number: _intrinsics(np.asarray(row["intrinsic"], np.float64)) for number, row in rows.items()}
         found = {number: _pose(row) for number, row in rows.items()}
-        k = np.median(stated, axis=0)
-        intrinsics = check_intrinsics([float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])])
     except (KeyError, TypeError, ValueError, OptionError):
         raise SourceError(
             f"{path}: a frame lacks intrinsic (3 x 3) or aligned_pose (4 x 4); mend or remove it"
         ) from None
-    return intrinsics, {number: T for number, T in found.items() if T is not None}
+    return stated, {number: T for number, T in found.items() if T is not None}
+
+
+def _intrinsics(matrix: NDArray[np.float64]) -> Intrinsics:
+    k = matrix.reshape(3, 3)
+    return check_intrinsics([float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])])
 
 
 def _pose(row: Mapping[str, Any]) -> NDArray[np.float64] | None:

@@ -6,7 +6,6 @@ camera for pictures as stored, poses camera-to-world with OpenCV's axes already,
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -24,21 +23,30 @@ _MILLIMETRES = 1000.0
 
 
 def is_recording(root: Path) -> bool:
-    """Whether a folder is such a recording."""
-    return (root / "rgb.mp4").is_file() and (root / "odometry.csv").is_file()
+    """Whether a folder is such a recording, if without its poses or its camera.
+
+    Raises `SourceError` for one without its video.
+    """
+    tables = [(root / name).is_file() for name in ("odometry.csv", "camera_matrix.csv")]
+    if all(tables) and not (root / "rgb.mp4").is_file():
+        raise SourceError(f"{root} is a recording of Stray Scanner without its rgb.mp4; is the copy complete?")
+    return any(tables) and (root / "rgb.mp4").is_file()
 
 
 def open_recording(root: Path, options: SourceOptions) -> VideoWithDepth:
     """Return the frames of a recording. Raises `SourceError` and `OptionError` where the files do not fit together."""
     depths = sorted((root / "depth").glob("*.png")) + sorted((root / "depth").glob("*.npy"))
+    intrinsics, note = _matrix(root / "camera_matrix.csv") if options.intrinsics is None else (options.intrinsics, "")
+    odometry = root / "odometry.csv"
+    poses = "poses of odometry.csv (ARKit)" if odometry.is_file() else "there is no odometry.csv"
     parts = RecordingParts(
         "stray",
         root / "rgb.mp4",
-        options.intrinsics or _matrix(root / "camera_matrix.csv"),
+        intrinsics,
         {int(p.stem): p for p in depths if p.stem.isdigit()},
-        _odometry(root / "odometry.csv"),
+        _odometry(odometry) if odometry.is_file() else {},
         _MILLIMETRES,
-        "camera of camera_matrix.csv, poses of odometry.csv (ARKit)",
+        f"{note or 'camera as said'}, {poses}",
         z_up=True,
         poses_drift=True,
         confidence=lambda number: root / "confidence" / f"{number:06d}.png",
@@ -47,12 +55,18 @@ def open_recording(root: Path, options: SourceOptions) -> VideoWithDepth:
     return VideoWithDepth(root, parts, options)
 
 
-def _matrix(path: Path) -> Intrinsics:
-    rows = read_numbers(path) if path.is_file() else []
+def _matrix(path: Path) -> tuple[Intrinsics, str]:
+    """Return the camera, and how it is written."""
+    if not path.is_file():
+        raise SourceError(f"{path} is missing; is the copy complete? --intrinsics fx,fy,cx,cy says the camera, too")
+    rows = read_numbers(path)
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         raise SourceError(f"{path} is no 3x3 camera matrix; mend it, or give --intrinsics fx,fy,cx,cy")
+    note = "camera of camera_matrix.csv"
+    if rows[0][2] == rows[1][2] == 0 and any(rows[2][:2]):
+        rows, note = [list(row) for row in zip(*rows, strict=True)], f"{note} (written column by column)"
     try:
-        return check_intrinsics([rows[0][0], rows[1][1], rows[0][2], rows[1][2]])
+        return check_intrinsics([rows[0][0], rows[1][1], rows[0][2], rows[1][2]]), note
     except OptionError as error:
         raise SourceError(f"{path}: {error}") from None
 
@@ -60,9 +74,9 @@ def _matrix(path: Path) -> Intrinsics:
 def _odometry(path: Path) -> dict[int, NDArray[np.float64]]:
     """Poses by frame number. Raises `SourceError` for rows that are no numbers."""
     poses: dict[int, NDArray[np.float64]] = {}
-    for number, line in enumerate(islice(read_lines(path), 1, None), start=2):
+    for number, line in enumerate(read_lines(path), start=1):
         words = [word.strip() for word in line.split(",")]
-        if len(words) < 9:
+        if len(words) < 9 or (number == 1 and words[0].isidentifier()):
             continue
         try:
             _, frame, *values = (float(word) for word in words[:9])

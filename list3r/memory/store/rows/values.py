@@ -238,6 +238,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "S_graph_chunk": _SIM3,
         "extent": Rule("typeof({}) = 'blob' AND length({}) = 48", "a box"),
         "dropped": Rule("typeof({}) = 'blob'", "bits"),
+        "carried": Rule("typeof({}) = 'blob' AND length({}) = 32", "four numbers"),
     },
     "overlaps": {"scores": _bytes(36, "six numbers a pair")},
     "members": {"first_chunk": _CHUNK, "first_local": _LOCAL, "shown": _FLAG},
@@ -344,7 +345,7 @@ def bad_references(database: sqlite3.Connection, name: str) -> Iterator[str]:
         query = (
             f"SELECT chunk_id, frame_index FROM keyframes k WHERE NOT EXISTS ({inside} AND frame_index <= last_frame)"
         )
-        yield from (f"keyframes {u}:{n}: it is no frame of its chunk" for u, n in database.execute(query))
+        yield from (f"keyframes {u}:{n}: it is not a frame of its chunk" for u, n in database.execute(query))
     if name == "overlaps":
         chunks = "SELECT u AS chunk_id FROM overlaps UNION SELECT v FROM overlaps"
         alone = "SELECT chunk_id FROM redundant EXCEPT SELECT chunk_id FROM members"

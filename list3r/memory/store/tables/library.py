@@ -7,7 +7,7 @@ as a whole.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -33,6 +33,9 @@ class SettledRow:
     S_graph_chunk: Sim3
     extent: Annotated[NDArray[np.float64], Shape((2, 3))]
     """Box round its points in the frame of the graph, grown by half of what lies near. Shape (2, 3)."""
+    carried: Annotated[NDArray[np.float64], Shape((4,))] = field(default_factory=lambda: np.zeros(4))
+    """How far it has shifted (metres) and turned (degrees) against others, its up has turned (degrees), and it has
+    turned in the world (degrees), since what was derived of it was derived. Shape (4,)."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,19 @@ class Settled:
         known = {**self.all(), **rows}
         self._rows.put((_OfChunk(k, row) for k, row in rows.items()), dropped=b"")
         self._known = dict(sorted(known.items()))
+
+    def carry(self, rows: Mapping[int, SettledRow]) -> None:
+        """Settle chunks where they were carried to; which of their points were dropped still holds."""
+        known = {**self.all(), **rows}
+        columns = Columns.of(SettledRow)
+        values = [(*held, k) for k, held in zip(rows, columns.rows(list(rows.values())), strict=True)]
+        names = ", ".join(f"{name} = ?" for name in columns.names)
+        self._connection.execute_many(f"UPDATE settled SET {names} WHERE chunk_id = ?", values)
+        self._known = dict(sorted(known.items()))
+
+    def rest(self) -> None:
+        """Forget how far chunks were carried, for all is derived anew where they lie."""
+        self.carry({k: replace(row, carried=np.zeros(4)) for k, row in self.all().items() if row.carried.any()})
 
     def drop(self, chunk_id: int) -> None:
         """Forget where a chunk settled."""
@@ -244,6 +260,10 @@ class Redundant:
         """Return the ids of the chunks of which some local instances are redundant and others are not."""
         rows = self._connection.rows("SELECT DISTINCT chunk_id FROM redundant")
         return {k for (k,) in rows} - self.chunks()
+
+    def compared(self) -> list[Key]:
+        """Return the pairs of chunks of which one has a redundant local instance that is like one of the other."""
+        return self._connection.rows("SELECT DISTINCT chunk_id, like_chunk FROM redundant ORDER BY 1, 2")
 
     def of(self, chunk_ids: Sequence[int]) -> list[RedundantInstance]:
         """Return the redundant local instances of some chunks, none of which is in a group, in no order."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from list3r.memory.records import Observation
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns
-from list3r.memory.store.rows.table import Table
+from list3r.memory.store.rows.table import Table, batches
 from list3r.memory.store.tables.ids import Ids
 
 
@@ -40,6 +40,11 @@ class Observations:
     def of(self, instance_id: int) -> list[Observation]:
         """Return the local instances that make up an instance, which may be an alias. Raises `UnknownIdError`."""
         return self._rows.all("instance = ?", (self._ids.resolve(instance_id),))
+
+    def chunks_of(self, ids: Sequence[int]) -> list[tuple[int, int]]:
+        """Return (instance id, chunk id) of the chunks that see some instances, in order."""
+        query = "SELECT DISTINCT instance, chunk_id FROM observations WHERE instance IN ({})"
+        return sorted(row for part, marks in batches(ids) for row in self._connection.rows(query.format(marks), part))
 
     def owners(self, keys: Sequence[tuple[int, int]]) -> dict[tuple[int, int], int]:
         """Return the instances of these local instances (chunk id, local id) that belong to one."""

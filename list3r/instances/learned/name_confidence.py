@@ -1,4 +1,4 @@
-"""How far the names that the judge of things gives can be believed, also in rooms unlike those that it learned from."""
+"""How far names given by the classifier of things can be trusted, also in rooms unlike those of its training."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 LEAST, MOST_SURE = 0.018, 1e-3
-"""No name is taken to be less probable, nor to be wrong with less probability, when odds are told."""
+"""Odds take no name to be less probable, nor to be wrong with less probability."""
 
 
 @dataclass(frozen=True)
 class NameSigns:
-    """What tells whether the likeliest names of T things are right."""
+    """Signs of whether the likeliest names of T things are right."""
 
     odds: Float
     """Log odds of the name. Shape (T,)."""
     whole: Float
     """Probability that the thing is one whole. Shape (T,)."""
     others: float
-    """Mean log odds of the likeliest names of the chunk's things, pulled towards 0 where they are few: where most are
-    in doubt the network knows the room badly."""
+    """Mean log odds of the likeliest names of the chunk's things, pulled towards 0 where they are few. It is low
+    where the network does not know the room."""
 
 
 @dataclass(frozen=True)
-class NameBelief:
+class NameConfidence:
     """Log odds that the likeliest name of a thing is right: logistic regression on rooms that the networks did not
     learn from, none of them furnished by others (docs/decisions/0144-names-in-rooms-of-others.md).
     """
@@ -48,7 +48,7 @@ def name_signs(names: Float, whole: Float, structure: Float) -> NameSigns:
     return NameSigns(odds, whole, float((weight * odds).sum() / (weight.sum() + 1.0)))
 
 
-def believed(names: Float, right: Float) -> Float:
+def with_confidence(names: Float, right: Float) -> Float:
     """Return names (T, C) of which the likeliest has the probability `right` (T,).
 
     Where that is less than before, what is taken off goes to none of the names.

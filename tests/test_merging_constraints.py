@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from list3r.memory.constraints import Constraints, Edit, Key, standing
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging.edges import merge_nodes
 from list3r.memory.overlap.voxels import chunk_shapes
-from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, TWIN, node, surface, walk
+from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, TWIN, merge_nodes, node, surface, walk
 
 WALK = walk([MUG, TWIN, BOX], 3, linked=False)
 KEYS = sorted(WALK.truth)

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from list3r.queries.match import FilterOptions
 
 OF_LOOKS = ("label", "color", "min_size", "max_size", "min_confidence", "structure")
-"""Filters of questions that neither states nor parts of a memory matter to."""
+"""The filters of questions that do not ask for a state or a component."""
 
 
 @dataclass(frozen=True)
-class FilterWords:
+class FilterArguments:
     """Which things may answer."""
 
     label: Label = None
@@ -61,25 +61,27 @@ class FilterWords:
 
 
 @dataclass(frozen=True)
-class NearWords:
+class NearArguments:
     """What to be near to."""
 
-    words: Annotated[str | None, typer.Argument(metavar="[WORDS]", help="Words of a label or description.")] = None
+    words: Annotated[str | None, typer.Argument(metavar="[WORDS]", help="Only things that these words name.")] = None
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None
     id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Distance from this instance.")] = None
-    max_distance: Annotated[float | None, typer.Option("--max-distance", help="Surfaces no further than this.")] = None
+    max_distance: Annotated[
+        float | None, typer.Option("--max-distance", help="Only things whose surface is no further than this.")
+    ] = None
 
     def origin(self) -> tuple[float, float, float] | None:
         """Return the point. Raises `OptionError` where nothing is named, or by what is no point."""
         from list3r.memory.errors import OptionError
 
         if self.words is None and self.point is None and self.id is None:
-            raise OptionError("say what to be near to: --point x,y,z, --id ID, or words such as mug")
+            raise OptionError("say near what: --point x,y,z, --id ID, or words such as mug")
         return None if self.point is None else parse_point(self.point, "--point")
 
 
 @dataclass(frozen=True)
-class CameraWords:
+class CameraArguments:
     """A camera: that of a frame, or one put somewhere."""
 
     time: Time = None
@@ -90,7 +92,7 @@ class CameraWords:
 
 
 @dataclass(frozen=True)
-class RegionWords:
+class RegionArguments:
     """A box, or a sphere."""
 
     box: Annotated[
@@ -99,7 +101,7 @@ class RegionWords:
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Centre of a sphere.")] = None
     radius: Annotated[float | None, typer.Option("--radius", help="Radius of the sphere.")] = None
 
-    def lengths(self, camera: CameraWords) -> dict[str, Sequence[float] | float]:
+    def lengths(self, camera: CameraArguments) -> dict[str, Sequence[float] | float]:
         """Return the region, nothing for that of a camera. Raises `OptionError` unless there is one of them."""
         from list3r.memory.errors import OptionError
 
@@ -122,46 +124,52 @@ class RegionWords:
 
 
 @dataclass(frozen=True)
-class RelationWords:
+class RelationArguments:
     """Which relations, and who looks."""
 
     subject: Annotated[
-        str | None, typer.Option("--subject", metavar="ID|WORDS", help="Who stands in the relation.")
+        str | None, typer.Option("--subject", metavar="ID|WORDS", help="First member of the relation: an id or words.")
     ] = None
     predicate: Annotated[
         str | None,
         typer.Option(
             "--predicate",
             metavar="PREDICATE",
-            help="on, supports, in, contains, above, below, under, next_to, near, attached_to, between; for who looks "
-            "(--from) left_of, right_of, in_front_of, behind.",
+            help="on, supports, in, contains, above, below, under, next_to, near, attached_to, between; seen "
+            "from --from: left_of, right_of, in_front_of, behind.",
         ),
     ] = None
-    object: Annotated[str | None, typer.Option("--object", metavar="ID|WORDS", help="To whom.")] = None
-    other: Annotated[str | None, typer.Option("--and", metavar="ID|WORDS", help="The second object of between.")] = None
+    object: Annotated[
+        str | None, typer.Option("--object", metavar="ID|WORDS", help="Second member of the relation.")
+    ] = None
+    other: Annotated[
+        str | None, typer.Option("--and", metavar="ID|WORDS", help="For between: the other of the two things.")
+    ] = None
     viewpoint: Annotated[
         str | None,
         typer.Option(
             "--from",
             metavar="ID|camera|X,Y,Z",
-            help="Who looks, for left_of, right_of, in_front_of and behind: from the centre of an instance, from "
-            "where the camera was last (camera) or in a frame (camera:FRAME), or from a point; towards the middle "
-            "of the two.",
+            help="Viewpoint of left_of, right_of, in_front_of and behind: the centre of an instance, the last place of "
+            "the camera (camera), its place in a frame (camera:FRAME), or a point. The view is towards the middle of "
+            "the two things.",
         ),
     ] = None
-    min_confidence: Annotated[float, typer.Option("--min-confidence", help="Only relations at least this sure.")] = 0.0
+    min_confidence: Annotated[
+        float, typer.Option("--min-confidence", help="Only relations with at least this confidence.")
+    ] = 0.0
 
 
 @dataclass(frozen=True)
-class LikeWords:
+class SimilarArguments:
     """What things are compared with."""
 
-    id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Things like this one.")] = None
+    id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Compare with this instance.")] = None
     image: Annotated[
-        Path | None, typer.Option("--image", metavar="FILE", help="Things like what this picture shows.")
+        Path | None, typer.Option("--image", metavar="FILE", help="Compare with what this picture shows.")
     ] = None
     box: Annotated[
-        str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only what is in this box of the picture, px.")
+        str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only the part of the picture in this box, px.")
     ] = None
 
     def corners(self) -> tuple[float, float, float, float] | None:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from list3r.memory.overlap.missed import bears_out, frames_beside
+from list3r.memory.overlap.missed import frames_beside, pictures_confirm
 from list3r.memory.overlap.voxels import PIXEL_BITS, ChunkShapes, chunk_shapes
 
 FRAMES = range(0, 30, 3)
@@ -29,7 +29,7 @@ def first(count: int) -> np.ndarray:
 
 def agreed(part: ChunkShapes, whole: ChunkShapes) -> bool:
     chunks = {1: part, 2: whole}
-    return bears_out((1, 5), (2, 9), chunks, frames_beside(chunks, [(1, 2)]), 0.25)
+    return pictures_confirm((1, 5), (2, 9), chunks, frames_beside(chunks, [(1, 2)]), 0.25)
 
 
 def test_pixels_of_the_larger_one_bear_it_out() -> None:
