@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("open3d")
 
+from list3r.memory.errors import SourceError
 from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, kinds_at
 from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
@@ -75,6 +76,33 @@ def test_a_gazebo_world_of_others_is_filmed_with_its_truth(tmp_path: Path) -> No
     ray = np.array([(u - film.camera.cx) / film.camera.fx, (v - film.camera.cy) / film.camera.fy, 1.0])
     point = film.T_world_cam[k, :3, :3] @ (ray * film.true_depth[k, v, u]) + film.T_world_cam[k, :3, 3]
     assert (np.abs(point - [1.5, 0.0, 0.85]) < [0.17, 0.12, 0.17]).all()
+
+
+def test_models_within_models_and_the_ground_are_read(tmp_path: Path) -> None:
+    from training.worlds.gazebo import film_house, house_extents
+
+    (tmp_path / "worlds").mkdir()
+    file = tmp_path / "worlds" / "office.world"
+    table = model("Table", "<box><size>0.8 0.6 0.7</size></box>", "1 0 0.35 0 0 0")
+    wall = model("Wall", "<box><size>0.1 6 3</size></box>", "2 0 1.5 0 0 0")
+    office = f"<model name='office'><pose>0.5 0 0 0 0 1.5707963</pose>{table}{wall}</model>"
+    ground = model("ground_plane", "<plane><normal>0 0 1</normal></plane>")
+    file.write_text(f"<sdf version='1.6'><world name='w'>{ground}{office}</world></sdf>")
+    (extent,) = house_extents(file).values()
+    assert np.allclose(extent, [[0.2, 0.6, 0.0], [0.8, 1.4, 0.7]], atol=1e-6)
+    film = film_house(file, 1, "structured", frames=3)
+    kinds = {t.id: (t.kind, t.structure) for t in film.things}
+    assert {kinds[k] for k in np.unique(film.ids).tolist() if k} >= {("ground_plane", True), ("Table", False)}
+
+
+def test_a_place_without_a_walk_says_so(tmp_path: Path) -> None:
+    from training.worlds.gazebo import film_house
+
+    file = tmp_path / "empty.world"
+    ground = model("ground_plane", "<plane><normal>0 0 1</normal></plane>")
+    file.write_text(f"<sdf version='1.6'><world name='w'>{ground}</world></sdf>")
+    with pytest.raises(SourceError, match=r"no walk with seed 2 through empty\.world"):
+        film_house(file, 2, "structured")
 
 
 def model(name: str, shape: str, pose: str = "0 0 0 0 0 0") -> str:

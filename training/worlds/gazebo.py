@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.memory.errors import SourceError
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import Stop
 from training.worlds.collada import TexturedMesh, read_collada
@@ -28,8 +29,10 @@ from training.worlds.mesh import turn
 from training.worlds.render import Caster, Hits, Light, Renderer
 from training.worlds.sensors import drift_field, read
 
-STRUCTURE = ("Wall", "Ceiling", "Floor", "Column", "ground_plane", "office_small", "office_env")
+STRUCTURE = ("Wall", "Ceiling", "Floor", "Column", "ground_plane", "office_small", "office_env", "floor_")
 """Words in the names of models that bound a room; a `FloorB` is one, a `FloorLamp` would not be."""
+PLANE_M = 60.0
+"""Edge of what is drawn of a plane without end."""
 _SCHEME = re.compile(r"^(model://|file://models/)")
 _STILL = np.zeros(3)
 
@@ -46,12 +49,12 @@ class _House:
         self.owner: list[int] = []
         self.things: list[Truth] = []
         for model in world.iterfind("model"):
-            self._add(model, _state(world, model.get("name", "")))
+            self._add(model, _state(world.find("state"), model.get("name", "")))
 
-    def _add(self, model: ET.Element, state: ET.Element | None) -> None:
-        """Add a model that the world holds or includes; its state, if it has one, tells where its links are now."""
+    def _add(self, model: ET.Element, state: ET.Element | None, T_world: NDArray[np.float64] | None = None) -> None:
+        """Add a model that the world or another model holds or includes; its state tells where its links are now."""
         uri = model.findtext("include/uri", "").strip()
-        T = _pose(model)
+        T = _pose(model) if T_world is None else T_world @ _pose(model)
         if uri:
             description = self._models / _SCHEME.sub("", uri) / "model.sdf"
             if not description.exists():
@@ -70,6 +73,8 @@ class _House:
                 self.meshes.append(_moved(shown, at))
                 self.owner.append(number)
         self.things.append(Truth(number, name, name, name, any(s in name for s in STRUCTURE)))
+        for held in model.iterfind("model"):
+            self._add(held, _state(state, held.get("name", "")), T)
 
     def _shown(self, link: ET.Element) -> list[TexturedMesh]:
         """What a link shows, in its frame; what it collides with where the files of that are missing."""
@@ -138,9 +143,9 @@ def _pose(element: ET.Element) -> NDArray[np.float64]:
     return T
 
 
-def _state(world: ET.Element, name: str) -> ET.Element | None:
+def _state(saved: ET.Element | None, name: str) -> ET.Element | None:
     """Return where the links of a model were when the world was saved."""
-    return next((m for m in world.iterfind("state/model") if m.get("name") == name), None)
+    return next((m for m in saved.iterfind("model") if m.get("name") == name), None) if saved is not None else None
 
 
 def _moved(mesh: TexturedMesh, T: NDArray[np.float64]) -> TexturedMesh:
@@ -148,10 +153,15 @@ def _moved(mesh: TexturedMesh, T: NDArray[np.float64]) -> TexturedMesh:
 
 
 def _solids(geometry: ET.Element | None, image: Path | None, color: NDArray[np.float64]) -> list[TexturedMesh]:
-    """Return the mesh of a box or a cylinder; its picture lies on every triangle by the two axes it is widest in."""
+    """Return the mesh of a plane, a box or a cylinder.
+
+    Its picture lies on every triangle by the two axes it is widest in.
+    """
     import trimesh
 
-    if geometry is not None and (box := geometry.find("box")) is not None:
+    if geometry is not None and geometry.find("plane") is not None:
+        solid = trimesh.creation.box(extents=(PLANE_M, PLANE_M, 1e-3))
+    elif geometry is not None and (box := geometry.find("box")) is not None:
         solid = trimesh.creation.box(extents=_numbers(box.findtext("size", "")))
     elif geometry is not None and (tube := geometry.find("cylinder")) is not None:
         radius, length = (float(tube.findtext(k, "0")) for k in ("radius", "length"))
@@ -221,9 +231,10 @@ def film_house(
     rng = np.random.default_rng([seed, 17])
     camera = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
     walk = PathSettings(fps=12.0 / every)
-    time_s, poses = camera_path(
-        visit.tour(_stops(house, caster, rng, folder.is_dir())), frames, walk, seed + visit.number
-    )
+    stops = _stops(house, caster, rng, folder.is_dir())
+    if len(stops) < 2:
+        raise SourceError(f"no walk with seed {seed} through {folder.name}: too few free places that see its things")
+    time_s, poses = camera_path(visit.tour(stops), frames, walk, seed + visit.number)
     if visit.shifts:
         house = house.changed(visit.shifts)
         caster = Caster([(m.vertices, m.triangles) for m in house.meshes])
