@@ -19,7 +19,9 @@ chunks, descriptors and joint windows, and chunks end at cuts in all of them but
 - ilrd-paper: loops accepted by s_loop alone, as the paper writes it;
 - verified: loops proposed by frame similarity and verified by geometry, no instance anywhere;
 - ilrd: + instances rank candidates and object to relations;
-- iasm: + instance-aware support;
+- iasm-paper: instance-aware merging as the paper writes it, `benchmarks/peers/paper_support.py`: instances whose
+  delta(o) is large leave, and the support is sampled by confidence and coverage;
+- iasm: instance-aware support as builds have it in its place;
 - cwgo-paper: iasm with the paper's weights of edges in the graph;
 - graph: iasm with covariances as weights and loops that can be switched off;
 - full: + nodes within chunks, what builds use;
@@ -38,7 +40,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 from machine import STARTED_AT, machine, write_json
@@ -55,6 +56,7 @@ TITLES = {
     "ilrd-paper": "loops by s_loop alone (paper)",
     "verified": "verified loops, no instances",
     "ilrd": "+ instances in loops (ILRD)",
+    "iasm-paper": "IASM as the paper writes it",
     "iasm": "+ instance-aware support (IASM)",
     "cwgo-paper": "IASM, the paper's weights",
     "graph": "+ covariances, robust (CWGO)",
@@ -176,6 +178,7 @@ def run_video(job: tuple[str, int, Sequence[str], str]) -> list[dict[str, Any]]:
 
 def variant_settings(variant: str) -> Any:
     """Return the product's settings with the parts that a variant lacks switched off."""
+    from benchmarks.peers.paper_support import PaperSupportSettings
     from list3r.pipeline.settings import AssociationSettings
 
     full = AssociationSettings()
@@ -186,11 +189,13 @@ def variant_settings(variant: str) -> Any:
     loops = _without_instances(full.revisits) if blind else full.revisits
     if variant == "ilrd-paper":
         loops = replace(loops, verified=False)
-    aware = variant in ("iasm", "cwgo-paper", "graph", "full")
     graph = {"cwgo-paper": paper_weights}.get(variant, plain_graph)
+    edges = full.edges if variant in ("iasm", "cwgo-paper", "graph", "full") else plain_edges
+    if variant == "iasm-paper":
+        edges = replace(full.edges, support=PaperSupportSettings())
     return AssociationSettings(
-        revisits=loops if aware else replace(loops, window=replace(loops.window, edges=plain_edges)),
-        edges=full.edges if aware else plain_edges,
+        revisits=replace(loops, window=replace(loops.window, edges=edges)),
+        edges=edges,
         graph=full.graph if variant in ("graph", "full", "full-no-instances") else graph,
         nodes=full.nodes if variant.startswith("full") else replace(full.nodes, enabled=False),
     )
@@ -210,7 +215,7 @@ def _without_instances(revisits: Any) -> Any:
 
 def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, truth: _Truth) -> dict[str, Any]:
     """Build a memory of the chunks (placed only) and measure it."""
-    from benchmarks.peers.plain_alignment import plain_support
+    from benchmarks.peers.paper_support import paper_merging
     from list3r.association.overlap.motion import flag_moving
     from list3r.frames.base import Camera
     from list3r.memory.store.store import Store
@@ -228,11 +233,11 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, tr
             _place_as_vggt_long(store, session, results, model.descriptors, joint)
         for result in () if peer else results:
             chunk = result
-            if settings.edges.instance_aware:
+            if settings.edges.instance_aware and variant != "iasm-paper":
                 height, width = result.image_size
                 camera = Camera(width, height, *result.intrinsics)
                 chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
-            with patch("list3r.association.overlap.edges.align_support", plain_support):
+            with paper_merging():
                 add_chunk(store, session, chunk, joint, settings, library=False)
         if not peer:
             finish_session(store, session, settings, library=False)
