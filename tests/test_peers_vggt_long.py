@@ -1,6 +1,12 @@
-"""VGGT-Long's way, held against what its published code does on cases made by hand."""
+"""VGGT-Long's and Pi-Long's way, held against what their published code gave on cases made by hand.
+
+`tests/published_cases.py` was run through LoopModel.py, sim3utils.py and sim3loop.py of VGGT-Long (6b9f61f) and of
+Pi-Long (ae567d9), which gave the same numbers; they stand here. docs/decisions/0150 has a comparison on random cases.
+"""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,8 +20,45 @@ from benchmarks.peers.vggt_long import (
     robust_similarity,
 )
 from list3r.memory.geometry import Sim3
+from tests.published_cases import SPANS, looks_of_a_walk, matched_points, ring_with_a_loop
 
 SETTINGS = VggtLongSettings()
+
+
+def test_the_published_code_selects_the_same_loops_and_windows() -> None:
+    loops = find_loops(looks_of_a_walk(), SETTINGS)
+    assert loops == [(122, 88), (192, 158), (52, 18)]
+    # the second one lies within a chunk and is dropped there
+    assert loop_windows(SPANS, loops, SETTINGS) == [
+        LoopWindow(4, (120, 140), 2, (78, 98)),
+        LoopWindow(1, (42, 62), 0, (8, 28)),
+    ]
+
+
+def test_the_published_code_aligns_points_alike() -> None:
+    found = robust_similarity(*matched_points(), SETTINGS)
+    published = [0.40665011, -0.147436681, 0.128888712, 0.329463422, -0.504599274, 0.214710177, 0.145681906]
+    assert found.log() == pytest.approx(published, abs=1e-8)
+
+
+def test_the_published_code_closes_a_ring_alike() -> None:
+    # in single precision there, and compared as steps from chunk to chunk
+    published = [
+        [0.9942, -0.0022, 0.0125, -0.0008, -0.0108, 0.9087, -0.0088],
+        [0.9929, 0.0220, 0.0145, -0.0009, -0.0149, 0.8922, 0.0096],
+        [0.9953, 0.0458, 0.0160, -0.0038, -0.0175, 0.9131, 0.0149],
+        [0.9999, 0.0663, 0.0159, -0.0076, -0.0173, 0.8907, 0.0028],
+        [1.0033, 0.0830, 0.0146, -0.0098, -0.0146, 0.9067, -0.0151],
+        [1.0028, 0.0983, 0.0128, -0.0090, -0.0114, 0.8843, -0.0222],
+        [0.9989, 0.1157, 0.0121, -0.0057, -0.0100, 0.9052, -0.0125],
+    ]
+    steps, (later, earlier, S) = ring_with_a_loop()
+    placed = [Sim3.identity()]
+    for step in steps:
+        placed.append(placed[-1] @ step)
+    closed = optimise(placed, [*((k, k + 1, x) for k, x in enumerate(steps)), (earlier, later, S)], SETTINGS)
+    found = [(a.inverse() @ b).log() for a, b in pairwise(closed)]
+    assert np.abs(np.array(found) - published).max() < 3e-4
 
 
 def _looks(places: list[int]) -> np.ndarray:

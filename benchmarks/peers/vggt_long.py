@@ -1,5 +1,9 @@
 """VGGT-Long's way from chunks to one world, written anew from its published code (DengKaiCQ/VGGT-Long, 6b9f61f).
 
+Pi-Long (DengKaiCQ/Pi-Long, ae567d9) goes the same way by the same code: its loop selection, loop windows and optimiser
+are those files, its alignment the same rounds in single precision on a GPU. What differs is the network, and that its
+confidences lie in [0, 1], as those of the samples here do. So one row stands for both.
+
 What is taken from there, with the file: loop selection (LoopModels/LoopModel.py), windows and one loop a pair of chunks
 (loop_utils/sim3utils.py, vggt_long.py), alignment of point maps (sim3utils.py), loop edges through a joint window
 (vggt_long.py) and the optimiser (loop_utils/sim3loop.py, fastloop/solve_python.py). `base_config.yaml` has the
@@ -222,6 +226,9 @@ def optimise(
 ) -> list[Sim3]:
     """Return the places that fit the constraints (i, j, S_i_j) best, all of one weight and none robust.
 
+    A residual is log(S_i_j G_j G_i^-1) of inverse poses G, as published; the other way round it would weigh shifts in
+    another frame.
+
     Levenberg-Marquardt on the logarithms of the inverse poses, to which steps are added; the damping halves where a
     step helps and doubles where it does not. Every pose is free; the first one is put back to where it was.
     """
@@ -232,7 +239,7 @@ def optimise(
     def residual(x: Array, rows: NDArray[np.int64] | slice = slice(None)) -> Array:
         inverse = Sim3.exp(x)
         C = Sim3(measured.scale[rows], measured.rotation[rows], measured.translation[rows])
-        return (C.inverse() @ _at(inverse, i[rows]) @ _at(inverse, j[rows]).inverse()).log()
+        return (C @ _at(inverse, j[rows]) @ _at(inverse, i[rows]).inverse()).log()
 
     damping, costs = settings.damping, []
     for round_ in range(settings.iterations):
