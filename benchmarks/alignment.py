@@ -2,8 +2,9 @@
 
     python benchmarks/alignment.py [--seeds 1,2,3] [--ways ours,vggt_long_double] [--json FILE]
 
-518 x 378 point maps of a furnished room, noise growing with depth on both sides, 10 % outliers, truth known. Beside
-`align_point_maps`, support selection included:
+518 x 378 point maps of a furnished room, noise growing with depth on both sides, 10 % outliers, truth known. `builds`
+is what builds do: samples of each chunk on fixed pixel grids, rounded as they are stored, and the edge between them
+(`measure_edge`). Beside it `ours`, `align_point_maps` on all pixels, which builds do not use, and:
 - the way of VGGT-Long (Deng et al., 2025), written afresh from its description: pixels with a confidence over 0.1 of
   the smaller median on both sides, weights sqrt(c1 c2), scale from the ratio of the weighted RMS radii, rotation by
   SVD, five rounds of Huber re-weighting (delta 0.1) over all pairs, in single precision as there;
@@ -28,9 +29,14 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.peers.point_maps import align_point_maps
 from benchmarks.peers.vggt_long import VggtLongSettings, robust_similarity
+from list3r.association.overlap.edges import EdgeEnd, measure_edge
+from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.keyframe_record import frame_samples
 
 FRAMES, HEIGHT, WIDTH = 30, 378, 518
+FOCAL = 430.0
 OUTLIERS = 0.10
 NOISE = (0.004, 0.003)
 """Standard deviation of depth: first times depth plus second times its square, metres."""
@@ -45,6 +51,12 @@ class Overlap:
     confidence_u: Maps
     points_v: Maps
     confidence_v: Maps
+    depth_u: Maps
+    """In units of u. Shape (F, H, W)."""
+    depth_v: Maps
+    T_u_cam: NDArray[np.float64]
+    """Poses of the cameras. Shape (F, 4, 4)."""
+    T_v_cam: NDArray[np.float64]
     S_v_u: Sim3
     """Truth."""
     S_u_world: Sim3
@@ -64,13 +76,26 @@ def make_overlap(seed: int, both_sides: bool) -> Overlap:
     on_u = hit & (rng.random(depth.shape) < 0.5) if both_sides else np.zeros_like(hit)
     u = _observe(rng, rays, cams, depth, on_u, S_u_world)
     v = _observe(rng, rays, cams, depth, hit & ~on_u, S_v_world)
-    return Overlap(*u, *v, S_v_world @ S_u_world.inverse(), S_u_world, S_u_world.apply(np.array([[3.0, 2.5, 1.3]]))[0])
+    middle = S_u_world.apply(np.array([[3.0, 2.5, 1.3]]))[0]
+    poses = (_poses(rays, cams, S) for S in (S_u_world, S_v_world))
+    return Overlap(*u[:2], *v[:2], u[2], v[2], *poses, S_v_world @ S_u_world.inverse(), S_u_world, middle)
+
+
+def _poses(rays: NDArray[np.float64], cams: NDArray[np.float64], S_chunk_world: Sim3) -> NDArray[np.float64]:
+    """Camera-to-chunk poses (F, 4, 4): the columns of a rotation are the rays of a pixel to the right, below and ahead,
+    by differences."""
+    ahead = rays[:, HEIGHT // 2, WIDTH // 2]
+    right, down = (FOCAL * (rays[:, HEIGHT // 2 + dy, WIDTH // 2 + dx] - ahead) for dx, dy in ((1, 0), (0, 1)))
+    out = np.tile(np.eye(4), (len(cams), 1, 1))
+    out[:, :3, :3] = S_chunk_world.rotation @ np.stack([right, down, ahead], axis=-1)
+    out[:, :3, 3] = S_chunk_world.apply(cams)
+    return out
 
 
 def _walk(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rays of all pixels with unit depth, world axes, shape (F, H, W, 3), and camera centres (F, 3)."""
-    x = (np.arange(WIDTH) - WIDTH / 2) / 430.0
-    y = (np.arange(HEIGHT) - HEIGHT / 2) / 430.0
+    x = (np.arange(WIDTH) - WIDTH / 2) / FOCAL
+    y = (np.arange(HEIGHT) - HEIGHT / 2) / FOCAL
     camera = np.stack([*np.meshgrid(x, y), np.ones((HEIGHT, WIDTH))], axis=-1)
     level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     t = np.linspace(0.0, 1.0, FRAMES)
@@ -115,20 +140,33 @@ def _observe(
     depth: NDArray[np.float64],
     wrong: NDArray[np.bool_],
     S_chunk_world: Sim3,
-) -> tuple[Maps, Maps]:
-    """Points and confidence: it falls with the noise, and knows two of three outliers."""
+) -> tuple[Maps, Maps, Maps]:
+    """Points, confidence and depth: confidence falls with the noise, and knows two of three outliers."""
     sigma = NOISE[0] * depth + NOISE[1] * depth**2
     seen = depth + sigma * rng.normal(size=depth.shape)
     seen[wrong] *= rng.uniform(0.4, 2.5, int(wrong.sum()))
     confidence = 1.0 / (1.0 + sigma / 0.03) * rng.uniform(0.7, 1.0, depth.shape)
     confidence[wrong & (rng.random(depth.shape) < 2 / 3)] *= 0.3
     world = cams[:, None, None] + seen[..., None] * rays
-    return S_chunk_world.apply(world.reshape(-1, 3)).reshape(world.shape).astype(np.float32), confidence.astype(
-        np.float32
-    )
+    points = S_chunk_world.apply(world.reshape(-1, 3)).reshape(world.shape)
+    return tuple(a.astype(np.float32) for a in (points, confidence, float(S_chunk_world.scale) * seen))  # type: ignore[return-value]
 
 
 # ---------------------------------------------------------------------------------------------- the ways
+
+
+def builds(overlap: Overlap) -> Sim3:
+    """What builds do with two chunks that share frames."""
+    o, camera = overlap, Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    sides = ((o.depth_u, o.confidence_u, o.T_u_cam), (o.depth_v, o.confidence_v, o.T_v_cam))
+    every, frames = np.ones(FRAMES, bool), np.arange(FRAMES)
+    u, v = (
+        frame_samples(
+            Reconstruction(frames, every, T, camera, depth, confidence.astype(np.float16), "relative", frames)
+        )
+        for depth, confidence, T in sides
+    )
+    return measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), camera, metric=False).edge.S_v_u
 
 
 def ours(overlap: Overlap) -> Sim3:
@@ -188,6 +226,7 @@ def vggt_long_double(overlap: Overlap) -> Sim3:
 
 
 WAYS: dict[str, Callable[[Overlap], Sim3]] = {
+    "builds": builds,
     "ours": ours,
     "vggt_long": vggt_long,
     "vggt_long_double": vggt_long_double,
@@ -201,7 +240,7 @@ def measure(seed: int, both_sides: bool, ways: Sequence[str]) -> dict[str, dict[
     for name in ways:
         way = WAYS[name]
         seconds = []
-        for _ in range(3 if name == "ours" else 1):
+        for _ in range(3 if name in ("builds", "ours") else 1):
             begin = time.process_time()
             found = way(overlap)
             seconds.append(time.process_time() - begin)

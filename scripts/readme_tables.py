@@ -31,59 +31,102 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary() -> str:
-    """Return the few rows of README.md: what each part reaches, on which data, beside what bounds it."""
+    """Return the few rows of README.md: what each part reaches, by which measure, on which data, beside what bounds it,
+    and the commit that was measured."""
     depth, colour, scale = _read("redkitchen"), _read("sfm"), _read("scale")["sizes"][-1]
     worlds, house, own = (_read(n)["mean"] for n in ("discovery", "discovery-house", "simulated"))
-    safety = _read("safety")
     told = _read("relations")["pooled"]
-    fair = _read("association-fair")["runs"]
-    kills = safety["asked"]["kills"]
+    fair, returns_ = _read("association-fair")["runs"], _read("association-returns")["runs"]
+    kills = _read("safety")["asked"]["kills"]
 
-    def median(variant: str) -> float:
-        return statistics.median([r["ate_sim3_m"] for r in fair if r["variant"] == variant])
+    def ate(runs: Sequence[Any], variant: str) -> str:
+        e = [100 * r["ate_sim3_m"] for r in runs if r["variant"] == variant]
+        return f"{statistics.median(e):.1f} cm (mean {statistics.mean(e):.1f}, worst {max(e):.0f})"
 
     def things(mean: Any) -> str:
         return f"{mean['recall_0.25']:.2f} found, {mean['precision_0.25']:.2f} right"
 
+    boxes = "recall, precision of boxes at IoU 0.25"
     return _table(
-        ["", "reached", "for comparison"],
+        ["", "measure", "reached", "for comparison", "commit"],
         [
             [
                 "camera, a real kitchen of 1,000 frames, depth sensor",
+                "ATE RMSE after SE(3)",
                 f"{100 * depth['ate_se3_m']:.1f} cm, {depth['frames_per_second']:.0f} frames/s",
                 "truth itself good to a few cm",
+                _commit("redkitchen"),
             ],
             [
                 "the same by colour alone",
+                "ATE RMSE after Sim(3)",
                 f"{100 * colour['list3r']['ate_sim3_m']:.1f} cm, {colour['list3r']['frames_per_s']:.0f} frames/s",
                 f"plain pycolmap {100 * colour['pycolmap']['ate_sim3_m']:.1f} cm",
+                _commit("sfm"),
             ],
             [
-                "long videos with revisits, simulated network: median error",
-                f"{100 * median('full'):.1f} cm",
-                f"VGGT-Long's association {100 * median('vggt-long'):.1f} cm",
+                "long simulated videos with revisits, simulated network",
+                "ATE RMSE after Sim(3), median",
+                ate(fair, "full"),
+                f"VGGT-Long's association {ate(fair, 'vggt-long')}",
+                _commit("association-fair"),
             ],
-            ["things in homes of our own simulator (whole walks)", things(own), ""],
             [
-                "things in ten left-out worlds (one chunk)",
+                "the same where a place is seen again but looks otherwise",
+                "ATE RMSE after Sim(3), median",
+                ate(returns_, "full"),
+                f"without instances {ate(returns_, 'full-no-instances')}",
+                _commit("association-returns"),
+            ],
+            ["things in homes of our own simulator (whole walks)", boxes, things(own), "", _commit("simulated")],
+            [
+                "things in ten left-out worlds of our own simulator (one chunk)",
+                boxes,
                 things(worlds["learned"]),
                 f"with true masks {things(worlds['true'])}",
+                _commit("discovery"),
             ],
             [
-                "things in a house that others made (one chunk)",
+                "things in a house that others made, rendered (one chunk)",
+                boxes,
                 things(house["learned"]),
                 f"with true masks {things(house['true'])}",
+                _commit("discovery-house"),
             ],
             [
                 "`on`, in homes of our own simulator",
+                "recall, precision of pairs",
                 f"{own['on_recall']:.2f} found, {own['on_precision']:.2f} right",
                 f"with true masks {told['on']['recall']:.2f}, {told['on']['precision']:.2f}",
+                _commit("simulated"),
             ],
-            *([f"changes between two sessions, {name}", f"F1 {t['all']['f1']:.2f}", ""] for name, t in _sessions()[:1]),
-            ["`nearest` among a million instances", f"{scale['nearest_cpu_p50_ms']:.1f} ms", ""],
-            ["killed at random moments", f"{kills} times, nothing lost", ""],
+            *(
+                [
+                    f"changes between two sessions, {name}",
+                    "F1 of records",
+                    f"{t['all']['f1']:.2f}",
+                    "",
+                    _commit("sessions"),
+                ]
+                for name, t in _sessions()[:1]
+            ),
+            [
+                "`nearest` among a million instances",
+                "processor time, median",
+                f"{scale['nearest_cpu_p50_ms']:.1f} ms",
+                "",
+                _commit("scale"),
+            ],
+            ["killed at random moments", "what was lost", f"nothing in {kills} times", "", _commit("safety")],
         ],
     )
+
+
+def _commit(name: str) -> str:
+    """Return the commit at which a result was measured; older results name only the one that brought their file."""
+    result = _read(name)
+    measured = result.get("commit")
+    return str(measured).rstrip("+")[:7] if measured else f"{result['commit_of_file']}, file"
 
 
 def kitchen() -> str:

@@ -87,6 +87,31 @@ def again() -> Keyframe:
     return keyframes_at(0.7, first=200, gauge=GAUGE)[0]
 
 
+@pytest.mark.parametrize("most", [0, 2])
+def test_a_network_is_asked_a_bounded_number_of_times_where_features_fail(here: Keyframe, most: int) -> None:
+    # five places that look the same and whose features are those of something else
+    rng = np.random.default_rng(0)
+    other = [
+        replace(here, frame_index=300 * k, keypoint_descriptors=rng.permuted(here.keypoint_descriptors, axis=1))
+        for k in range(6)
+    ]
+    asked: list[Sequence[int]] = []
+    store = Chunks([(k,) for k in other], scale_kind="relative")
+    edges = find_loops(store, 5, lambda *ends: asked.append(ends), RevisitSettings(second_opinions=most))  # type: ignore[arg-type,func-returns-value]
+    assert len(asked) == most
+    assert len(edges) >= 4 and not any(e.accepted for e in edges)
+    said = [e.reason for e in edges if "cannot be reconstructed together" in e.reason]
+    assert len(said) == most
+
+
+def test_a_network_is_not_asked_where_features_tell(here: Keyframe, again: Keyframe) -> None:
+    asked: list[Sequence[int]] = []
+    far = replace(here, frame_index=100, descriptor=-here.descriptor)
+    store = Chunks([(here,), (far,), (again,)], scale_kind="relative")
+    edges = find_loops(store, 2, lambda *ends: asked.append(ends), RevisitSettings(second_opinions=3))  # type: ignore[arg-type,func-returns-value]
+    assert not asked and [e.accepted for e in edges] == [True]
+
+
 def test_a_keyframe_holds_what_it_says(here: Keyframe) -> None:
     assert np.linalg.norm(here.descriptor) == pytest.approx(1.0, abs=1e-5)
     assert here.keypoint_descriptors.dtype == np.uint8

@@ -12,7 +12,7 @@ from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError
 from list3r.reconstruction.features.learned import LEARNED_WIDTH, as_bytes, make_detector
 from list3r.reconstruction.features.local import match, nearest_pairs
-from list3r.reconstruction.keyframe_record import make_keyframes
+from list3r.reconstruction.keyframe_record import KeyframeNetworks, make_keyframes
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
 FILE = "aliked/aliked-t16.pth"
@@ -66,7 +66,7 @@ def test_keyframes_keep_them(weights: Path, shared_data: Path) -> None:
     frames = list(source.read(0, 3))
     reconstruction = RgbdReconstructor()(frames, source.info.camera)
     detector = make_detector("aliked", weights / FILE)
-    (first, *_) = make_keyframes(frames, reconstruction, False, detector=detector)
+    (first, *_) = make_keyframes(frames, reconstruction, False, networks=KeyframeNetworks(detector))
     assert first.keypoint_descriptors.shape == (len(first.keypoints_xy), LEARNED_WIDTH)
     plain = make_keyframes(frames, reconstruction, False)[0]
     np.testing.assert_array_equal(first.descriptor, plain.descriptor)

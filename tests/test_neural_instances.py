@@ -19,13 +19,14 @@ from list3r.instances.neural.appearance import Appearance, WithAppearance, label
 from list3r.instances.neural.candidates import SoftMasks, bounds_the_room, choose_candidates
 from list3r.instances.neural.query_segmenter import QuerySegmenter
 from list3r.instances.neural.sam_masks import SamMasks
-from list3r.instances.registry import check_choice, make_discoverer, make_tracker
+from list3r.instances.registry import check_choice, make_discoverer, make_frame_look, make_tracker
 from list3r.instances.settings import CandidateSettings, InstanceSettings, SamMaskSettings, VideoTrackerSettings
 from list3r.instances.tracking.video_tracker import VideoTracker, _Things
 from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
 from list3r.models import pretrained
 from list3r.models.images import InputShape, network_input, to_picture
+from list3r.reconstruction.keyframe_record import KeyframeNetworks, make_keyframes
 from tests import neural_models
 from tests.test_instances_library import SCENE, walk
 
@@ -166,6 +167,27 @@ def test_features_are_pooled_inside_masks(model: str, checkpoints: dict[str, Pat
     # The grid of 8 x 6 cells divides this picture evenly, so that all cells weigh the same.
     got = appearance.pooled(frames[0].color, whole, 1)[0]
     assert got @ mean / np.linalg.norm(mean) > 0.999
+
+
+@pytest.mark.parametrize("model", ["dinov2", "dinov3"])
+def test_a_frame_is_described_by_its_class_token_and_its_pooled_tokens(
+    model: str, checkpoints: dict[str, Path], chunk
+) -> None:
+    frames, reconstruction = chunk
+    folders = ((f"features/{model}", str(checkpoints[f"features/{model}"])),)
+    look = make_frame_look(model, folders, "cpu")
+    assert look is not None and make_frame_look("geometric", (), "cpu") is None
+    found = look(frames[0].color)
+    token, patches = Appearance(model, checkpoints[f"features/{model}"], "cpu").tokens(frames[0].color)
+    flat = patches.reshape(-1, 32).astype(float)
+    pooled = np.cbrt((flat**3).mean(axis=0))
+    for part, whole in ((found[:32], token), (found[32:], pooled)):
+        np.testing.assert_allclose(part, whole / np.linalg.norm(whole) / np.sqrt(2), atol=1e-5)
+    by = KeyframeNetworks(look=look)
+    few = replace(reconstruction, keyframes=np.array([0, 5]))
+    kept = make_keyframes(frames, few, False, networks=by)
+    np.testing.assert_allclose(kept[0].descriptor, found, atol=1e-6)
+    assert len(kept[0].keypoints_xy) > 0, "local features stay, for verification"
 
 
 def test_shares_count_every_pixel_once() -> None:

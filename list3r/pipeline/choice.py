@@ -67,6 +67,7 @@ def settings_resumed(
     if any(getattr(request, name) != getattr(default, name) for name in _NAMING):
         named, notes = _models_asked(request, info, licence)
         settings = replace(settings, **{name: getattr(named, name) for name in MODEL_CHOICES})
+        settings = replace(settings, frame_look=_look_beside(settings.features, begun))
     if settings.discovery not in DISCOVERERS:
         raise OptionError(
             f"this session was begun with --discovery {settings.discovery}, which this version does not have; "
@@ -80,7 +81,23 @@ def settings_resumed(
 def settings_beside(settings: BuildSettings, first: BuildSettings) -> BuildSettings:
     """Return the settings of a later session: what was asked for, with the stages of the memory's first session."""
     own = (*MODEL_CHOICES, "poses", "up", "chunks", "depth_every", "keep_pictures")
-    return replace(first, **{name: getattr(settings, name) for name in own})
+    found = replace(first, **{name: getattr(settings, name) for name in own})
+    return replace(found, frame_look=_look_beside(found.features, first))
+
+
+def _look_beside(features: str, first: BuildSettings) -> str:
+    """Return what describes frames of a session beside another: what described that one's, where that is at hand."""
+    return first.frame_look if features == first.features else "local"
+
+
+def look_doubts(settings: BuildSettings, first: BuildSettings) -> list[str]:
+    """Return a line where frames of a later session are described otherwise than those of the memory."""
+    if settings.frame_look == first.frame_look:
+        return []
+    return [
+        f"this memory finds places again by {first.features}; without --features {first.features} a session is "
+        "placed by its things alone"
+    ]
 
 
 def check_beside(settings: BuildSettings, first: BuildSettings) -> None:
@@ -126,6 +143,7 @@ def _models_asked(request: BuildRequest, info: SourceInfo, licence: str) -> tupl
         instance_weights=tuple(
             sorted((f"{part}/{getattr(selection, part)}", chosen[part]) for part in chosen if part != "reconstruction")
         ),
+        frame_look="local" if selection.features in ("geometric", "own") else "network",
         local_features=kind,
         feature_weights=file,
         keep_pictures=request.pictures,

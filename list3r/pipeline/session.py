@@ -26,7 +26,14 @@ from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights
 from list3r.models.licences import DEFAULT_PROFILE
 from list3r.models.presets import ModelSelection
-from list3r.pipeline.choice import check_beside, settings_asked, settings_beside, settings_resumed, stored_sessions
+from list3r.pipeline.choice import (
+    check_beside,
+    look_doubts,
+    settings_asked,
+    settings_beside,
+    settings_resumed,
+    stored_sessions,
+)
 from list3r.pipeline.chunks.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
 from list3r.pipeline.chunks.chunk import ChunkTask, get_ready, process_parts
 from list3r.pipeline.chunks.joint_windows import ChunkPool, joint_windows
@@ -133,7 +140,9 @@ def prepare(
             chosen, notes = settings_resumed(request, begun, info, run.licence)
         else:
             chosen, notes = settings_asked(request, info, run.licence)
-            chosen = chosen if first is None else settings_beside(chosen, first)
+            if first is not None:
+                chosen = settings_beside(chosen, first)
+                notes += look_doubts(chosen, first)
     else:
         chosen = settings
         if first is not None:
@@ -205,7 +214,7 @@ def add_chunks(
     bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
     watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
-    how = job.settings.association
+    how = _asking_networks(job.settings)
     if isinstance(pool, OrderedPool):
         pool.keep(plan.left)
     with threadpool_limits(1):
@@ -410,6 +419,16 @@ def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> Bui
     weights = found.pop("reconstruction", None)
     known |= {f"{name}/{getattr(chosen, name)}": where for name, where in found.items()}
     return replace(settings, weights=weights, instance_weights=tuple(sorted(known.items())))
+
+
+def _asking_networks(settings: BuildSettings) -> AssociationSettings:
+    """The settings of association; where a network makes the chunks, its joint windows are a second opinion."""
+    how = settings.association
+    if find_card(settings.reconstruction, "geometry") is None:
+        return how
+    revisits = how.revisits
+    most = max(revisits.second_opinions, revisits.of_networks)
+    return replace(how, revisits=replace(revisits, second_opinions=most))
 
 
 def usual_workers(settings: BuildSettings) -> int:

@@ -86,6 +86,9 @@ class BuildSettings:
     """What describes the look of a thing, by which it is recognised."""
     instance_weights: tuple[tuple[str, str], ...] = ()
     """Weights of the three, (part/model, a path or repository@commit), such as ("discovery/eomt", ...)."""
+    frame_look: str = "local"
+    """What describes whole keyframes, by which places are found again: local (their SIFT features), or network (that of
+    `features`, where it is one). That of the first session holds for a memory: only alike descriptors compare."""
     local_features: str = "sift"
     """What finds a keyframe again: sift or aliked; aliked also ties frames of `sfm` between which nothing can be
     followed."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,23 +20,37 @@ from list3r.reconstruction.features.vlad import describe_frame
 from list3r.reconstruction.rgbd.view import shrink_depth
 from list3r.reconstruction.settings import KeyframeSettings, SampleSettings
 
+FrameLook = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
+"""A unit descriptor (D,) of a whole picture (H, W, 3)."""
+
+
+@dataclass(frozen=True)
+class KeyframeNetworks:
+    """Networks that describe keyframes."""
+
+    detector: LearnedDetector | None = None
+    """Of local features, in the place of SIFT."""
+    look: FrameLook | None = None
+    """Of the whole frame, in the place of its SIFT features' VLAD."""
+
 
 def make_keyframes(
     frames: Sequence[Frame],
     reconstruction: Reconstruction,
     keep_jpeg: bool,
     settings: KeyframeSettings | None = None,
-    detector: LearnedDetector | None = None,
+    networks: KeyframeNetworks | None = None,
     library: LocalLibrary | None = None,
 ) -> tuple[Keyframe, ...]:
-    """Return the keyframes of a chunk in order of time; a `detector` takes the place of SIFT.
+    """Return the keyframes of a chunk in order of time.
 
     With pictures and a `library` also frames that are kept for their picture alone, so that of every instance one of
     the best views is kept.
     """
     chosen = settings or KeyframeSettings()
     kept = [int(p) for p in reconstruction.keyframes if reconstruction.posed[p]]
-    made = {p: _make_keyframe(frames[p], reconstruction, p, chosen, detector) for p in kept}
+    by = networks or KeyframeNetworks()
+    made = {p: _make_keyframe(frames[p], reconstruction, p, chosen, by) for p in kept}
     if keep_jpeg:
         if library is not None and made:
             like = made[kept[0]].descriptor
@@ -201,19 +215,19 @@ def _make_keyframe(
     reconstruction: Reconstruction,
     position: int,
     settings: KeyframeSettings,
-    detector: LearnedDetector | None,
+    networks: KeyframeNetworks,
 ) -> Keyframe:
     camera, depth = reconstruction.camera, reconstruction.depth[position]
     features = detect(frame.color, depth, camera, settings.features)
     small = camera.shrunk(settings.depth_width)
     kept = features
-    if detector is not None:
-        found = detector(frame.color, settings.learned_count)
+    if networks.detector is not None:
+        found = networks.detector(frame.color, settings.learned_count)
         kept = Features(found.xy, as_bytes(found.descriptors), points_at(found.xy, depth, camera))
     return Keyframe(
         frame_index=frame.index,
         T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
-        descriptor=describe_frame(features.descriptors),
+        descriptor=describe_frame(features.descriptors) if networks.look is None else networks.look(frame.color),
         keypoints_xy=kept.xy,
         keypoint_descriptors=kept.descriptors,
         points_cam=kept.points_cam,

@@ -2,9 +2,10 @@
 
 Frame descriptors propose with a relaxed threshold (`frame_search`); the two chunks' instances add s_sem and s_rel
 (`cues`); the likeliest by s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel) are verified by the keyframes' features
-and depth where they have them (`verification`), else by a joint window (`joint_window`); and nothing is believed that
-the way the camera went contradicts (`chain`). Every candidate becomes an edge, accepted or not, with its scores and
-the reason. How the weights were chosen: docs/decisions/0045.
+and depth where they have them (`verification`), else by a joint window (`joint_window`), which where networks make the
+chunks is asked also after features failed; and nothing is believed that the way the camera went contradicts (`chain`).
+Every candidate becomes an edge, accepted or not, with its scores and the reason. How the weights were chosen:
+docs/decisions/0045.
 """
 
 from __future__ import annotations
@@ -75,9 +76,12 @@ class RevisitSettings:
     """Most candidates of a chunk that are verified."""
     enough: int = 8
     """Accepted edges after which no further candidate of a chunk is verified."""
-    second_opinion: bool = False
-    """Try a joint window also where keyframes with features and depth were compared in vain. For RGB-D that costs
-    seconds a candidate and finds little more (redkitchen)."""
+    second_opinions: int = 0
+    """Most joint windows of a chunk where keyframes with features and depth were compared in vain. For RGB-D they cost
+    seconds each and find little more (redkitchen)."""
+    of_networks: int = 3
+    """The same where a network makes the chunks: three passes over 40 frames are about what the chunk itself took, and
+    a network relates views that share too little for features (docs/decisions/0151)."""
     most_ambiguous: float = 2.0
     """Relations that agree on where a part of the video lies that nothing tied to the rest before, for each one that
     says otherwise."""
@@ -217,6 +221,7 @@ class _Lookout:
         self._cues: dict[int, InstanceCues] = {}
         self._ways = Ways(store.edges.all(), settings.chain)
         self._tied = self._ways.tied_to(chunk_id)
+        self._second_opinions = settings.second_opinions
 
     def cues(self, u: int) -> InstanceCues:
         """Tell how the instances of a stored chunk agree with those of the new one."""
@@ -264,9 +269,10 @@ class _Lookout:
             check = verify if metric else verify_scaled
             edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification, later=later)
             edge = _objected(edge, objection) if self._settings.verified else edge
-        if joint is None or (edge is not None and (edge.accepted or not self._settings.second_opinion)):
+        if joint is None or (edge is not None and (edge.accepted or not self._second_opinions)):
             edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
         else:
+            self._second_opinions -= edge is not None
             ends = self._place(u, c.frame_u), self._place(v, c.frame_v)
             edge = joint_edge(joint, *ends, objection if self._settings.verified else None, self._settings.window)
         measured = bool(edge.S_v_u.translation.any())

@@ -1,4 +1,9 @@
-"""Object features from the patch tokens of DINOv2 or DINOv3, pooled inside each candidate's mask."""
+"""Features of DINOv2 or DINOv3: of things, patch tokens pooled inside each mask; of frames, the class token and all
+patch tokens, by which places are found again.
+
+A frame's patch tokens are pooled by their generalised mean of power 3 (GeM: Radenovic, Tolias, Chum, "Fine-tuning CNN
+image retrieval with no human annotation", 2019), so that few strong tokens tell more than many weak ones.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +50,17 @@ class Appearance:
             states = self._network(pixel_values=picture).last_hidden_state[0].float()
         patches = states[self._skipped :].reshape(rows, columns, -1)
         return states[0].cpu().numpy(), patches.cpu().numpy()
+
+    def whole(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Unit descriptor of a whole picture (H, W, 3): its class token beside its pooled patch tokens. Shape (2 D,).
+
+        The cosine of two pictures is the mean of both parts' cosines.
+        """
+        token, patches = self.tokens(color)
+        power = np.mean(patches.reshape(-1, patches.shape[-1]).astype(np.float64) ** 3, axis=0)
+        parts = token.astype(np.float64), np.cbrt(power)
+        both = np.concatenate([part / max(float(np.linalg.norm(part)), 1e-9) for part in parts])
+        return np.asarray(both / np.sqrt(2.0), np.float32)
 
     def pooled(self, color: NDArray[np.uint8], labels: NDArray[np.int32], count: int) -> NDArray[np.float32]:
         """Unit mean of the patch tokens under each label 1..count of a label image (H, W). Shape (count, D)."""

@@ -23,7 +23,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
-from list3r.instances.registry import make_discoverer, make_tracker
+from list3r.instances.registry import make_discoverer, make_frame_look, make_tracker
 from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.errors import BaselineError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
@@ -32,7 +32,7 @@ from list3r.models.device import memory_said
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
-from list3r.reconstruction.keyframe_record import frame_samples, make_keyframes
+from list3r.reconstruction.keyframe_record import FrameLook, KeyframeNetworks, frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, import_model, make_reconstructor
 
 
@@ -225,7 +225,8 @@ def _described(
     with memory_said("what finds and follows things"):
         library = build_library(frames, reconstruction, s.instances, discoverer or named, tracker)
     clock.mark("instances")
-    keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, _detector(s), library)
+    by = KeyframeNetworks(_detector(s), _frame_look(s))
+    keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, by, library)
     samples = frame_samples(reconstruction, library, s.models.samples)
     if reconstruction.depth_noise is None:  # stereo has no depth where things move; what it sees through is error
         library = flag_moving(samples, library, reconstruction.camera, s.motion)
@@ -342,6 +343,14 @@ def _instance_models(settings: BuildSettings) -> tuple[Discoverer, Tracker]:
         make_discoverer(settings.discovery, settings.features, folders, settings.device, settings.instances),
         make_tracker(settings.tracking, folders, settings.device, settings.instances),
     )
+
+
+def _frame_look(settings: BuildSettings) -> FrameLook | None:
+    """What describes whole frames; None for the VLAD of their SIFT features."""
+    if settings.frame_look == "local":
+        return None
+    folders = tuple((name, str(locate(weights))) for name, weights in settings.instance_weights)
+    return make_frame_look(settings.features, folders, settings.device)
 
 
 @lru_cache(maxsize=2)
