@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 import statistics
 import sys
@@ -209,7 +210,7 @@ def discovery() -> str:
 
 
 VARIANTS = {
-    "vggt-long": "VGGT-Long, its own loop selection, alignment and optimiser; no cut detection",
+    "vggt-long": "VGGT-Long and Pi-Long, their own loop selection, alignment and optimiser; no cut detection",
     "vggt-long-cuts": "the same, cuts given (as in all rows below)",
     "ilrd-paper": "loops by `s_loop` alone, as the paper writes it",
     "verified": "loops by frame similarity, verified by geometry, no instance",
@@ -250,6 +251,48 @@ def _ate_table(runs: Sequence[Any], names: dict[str, str], reference: str) -> st
 def fair() -> str:
     """Return the table of the variants of association against VGGT-Long as published."""
     return _ate_table(_read("association-fair")["runs"], VARIANTS, "vggt-long")
+
+
+def ranked() -> str:
+    """Return what instances bring in the older kinds of video, before and since s_loop refuses nothing."""
+    rows = []
+    for name, when in (("association-fair", "before"), ("association-now", "since")):
+        runs = {(r["preset"], r["seed"], r["variant"]): r for r in _read(name)["runs"]}
+        videos = sorted({key[:2] for key in runs})
+        on, off = ([runs[*v, variant] for v in videos] for variant in ("full", "full-no-instances"))
+        logs = [math.log(a["ate_sim3_m"] / b["ate_sim3_m"]) for a, b in zip(on, off, strict=True)]
+        middle, error = statistics.mean(logs), statistics.stdev(logs) / len(logs) ** 0.5
+        found = [f"{sum(r['true_loops'] for r in rs)} and {sum(r['false_loops'] for r in rs)}" for rs in (on, off)]
+        ratio = f"{math.exp(middle):.2f} ({math.exp(middle - error):.2f} to {math.exp(middle + error):.2f})"
+        better = f"{sum(x < 0 for x in logs)} of {len(videos)}"
+        rows.append([f"{when}, {_commit(name)}", ratio, better, *found])
+    heads = ["ATE with instances, as a share of that without (one standard error)", "better with them in"]
+    more = ["relations with instances: right, off by more than 0.5 m", "the same without"]
+    return _table(["s_loop refuses candidates that are verified", *heads, *more], rows)
+
+
+def corrected() -> str:
+    """Return what VGGT-Long's row is with the residual of its published code, beside what it was before."""
+    before = {
+        (r["preset"], r["seed"], r["variant"]): r["ate_sim3_m"]
+        for name in ("association-fair", "association-returns")
+        for r in _read(name)["runs"]
+    }
+    runs = [r for r in _read("association-vggt-long")["runs"] if (r["preset"], r["seed"], r["variant"]) in before]
+    presets = list(dict.fromkeys(r["preset"] for r in runs))
+    rows = []
+    for name, chosen in (*((p, [p]) for p in presets), ("all", presets)):
+        mine = [r for r in runs if r["preset"] in chosen and r["variant"] == "vggt-long"]
+        now, was, full = (
+            [r["ate_sim3_m"] for r in mine],
+            [before[r["preset"], r["seed"], "vggt-long"] for r in mine],
+            [before[r["preset"], r["seed"], "full"] for r in mine],
+        )
+        medians = [statistics.median(x) for x in (now, was, full)]
+        cells = [f"{m:.3f}" for m in medians]
+        rows.append([f"{name} ({len(mine)})", *cells, f"{medians[2] / medians[0]:.2f}"])
+    heads = ["VGGT-Long", "with the residual of before", "`full`", "`full` as a share of VGGT-Long"]
+    return _table(["median ATE of the same videos, m", *heads], rows)
 
 
 def returns() -> str:
@@ -305,11 +348,12 @@ def changed() -> str:
 
 def alignment() -> str:
     """Return the table of the alignment of whole point maps."""
-    single, double = _read("alignment"), _read("alignment-double")
+    single, double, builds = _read("alignment"), _read("alignment-double"), _read("alignment-builds")
     ways = [
-        ("ours, seeds 1 to 8", single, "ours"),
+        ("as builds do it, seeds 1 to 8", builds, "builds"),
+        ("ours on whole point maps, which builds do not use, seeds 1 to 8", single, "ours"),
         ("VGGT-Long's, seeds 1 to 8", single, "vggt_long"),
-        ("ours, seeds 1 and 2", double, "ours"),
+        ("ours on whole point maps, seeds 1 and 2", double, "ours"),
         ("VGGT-Long's in double precision, seeds 1 and 2", double, "vggt_long_double"),
     ]
     rows = []
@@ -448,6 +492,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "walks": walks,
     "discovery": discovery,
     "fair": fair,
+    "ranked": ranked,
+    "corrected": corrected,
     "returns": returns,
     "registration": registration,
     "changed": changed,

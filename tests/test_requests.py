@@ -15,6 +15,7 @@ from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.store.store import Store
 from list3r.pipeline.choice import (
     check_beside,
+    look_doubts,
     settings_asked,
     settings_beside,
     settings_resumed,
@@ -63,6 +64,21 @@ def test_a_later_session_takes_the_stages_of_the_first_and_what_is_asked_for() -
     check_beside(later, BEGUN)
     with pytest.raises(OptionError, match="whole_chunks"):
         check_beside(replace(BEGUN, library=ConsolidationSettings(whole_chunks=3)), BEGUN)
+
+
+def test_frames_of_a_later_session_are_described_as_the_first_ones_or_it_is_said() -> None:
+    first = replace(BEGUN, features="dinov2", frame_look="network")
+    same = settings_beside(BuildSettings(features="dinov2", frame_look="network"), first)
+    assert same.frame_look == "network" and look_doubts(same, first) == []
+    for other in ("geometric", "dinov3"):
+        later = settings_beside(BuildSettings(features=other, frame_look="network"), first)
+        assert later.frame_look == "local"
+        (said,) = look_doubts(later, first)
+        assert "by dinov2" in said and "--features dinov2" in said
+    later = settings_beside(BuildSettings(features="dinov2", frame_look="network"), BEGUN)
+    assert later.frame_look == "local" and look_doubts(later, BEGUN) == []
+    resumed, _ = settings_resumed(BuildRequest(features="geometric"), first, INFO, "research")
+    assert resumed.frame_look == "local"
 
 
 def test_the_sessions_of_a_memory_say_how_they_were_made(tmp_path: Path) -> None:

@@ -126,6 +126,13 @@ class Here:
     def __init__(self, work: Callable[[Any], Any], workers: int) -> None:
         self.map = functools.partial(map, work)
 
+    def start(self, ready: Callable[..., None], *given: Any) -> None:
+        """Get ready, as processes would."""
+        ready(*given)
+
+    def keep(self, count: int) -> None:
+        """There is nothing to end."""
+
     def ask(self, work: Callable[[Any], Any], question: Any) -> Any:
         """What a function makes of its argument."""
         return work(question)

@@ -253,6 +253,24 @@ def _teach_dust3r(model: Any, truth: Truth) -> None:
         _hook(module.proj if linear else module.head_pts3d, head(n == 1, linear))
 
 
+def _teach_fast3r(model: Any, truth: Truth) -> None:
+    def before(_module: Any, inputs: tuple[Any, ...]) -> None:
+        truth.look(torch.cat([(v["img"] + 1) / 2 for v in inputs[0]]))
+
+    def head(common: bool) -> Callable[[torch.Tensor], torch.Tensor]:
+        def say(out: torch.Tensor) -> torch.Tensor:
+            points, T = _local_points(truth), truth.T
+            if common:
+                points = torch.einsum("nij,nhwj->nhwi", T[:, :3, :3], points) + T[:, None, None, :3, 3]
+            return truth.next(f"common {common}", _raw_points(truth, points, slice(None)), len(out))
+
+        return say
+
+    model.register_forward_pre_hook(before)
+    _hook(model.downstream_head.dpt, head(True))
+    _hook(model.downstream_head_local.dpt, head(False))
+
+
 TEACHERS: dict[str, Callable[[Any, Truth], None]] = {
     "pi3": _teach_pi3,
     "pi3x": _teach_pi3,
@@ -263,6 +281,7 @@ TEACHERS: dict[str, Callable[[Any, Truth], None]] = {
     "mast3r": _teach_dust3r,
     "cut3r": _teach_cut3r,
     "ttt3r": _teach_cut3r,
+    "fast3r": _teach_fast3r,
 }
 
 
@@ -286,6 +305,8 @@ def cut_down(name: str, patch: pytest.MonkeyPatch) -> dict[str, Any]:
         return {"embed_dim": 64}
     if name in ("dust3r", "mast3r", "cut3r", "ttt3r"):
         return _croco(name)
+    if name == "fast3r":
+        return _fast3r()
     return {"model_name": "da3-small"} if name == "da3" else _mapanything()
 
 
@@ -313,6 +334,20 @@ def _croco(name: str) -> dict[str, Any]:
         return plan | {"head_type": "catconv", "output_mode": "pts3d+desc24", "two_confs": True}
     state = {"state_size": 16, "state_pe": "2d", "local_mem_size": 8, "state_dec_num_heads": 2, "rgb_head": False}
     return plan | state | {"output_mode": "pts3d+pose", "pose_head": True, "pose_mode": plan["depth_mode"]}
+
+
+def _fast3r() -> dict[str, Any]:
+    """The plan of the published weights, narrower and with fewer layers; its head asks for ten in the decoder."""
+    small = {"embed_dim": 32, "num_heads": 2, "mlp_ratio": 4, "attn_implementation": "pytorch_naive"}
+    encoder = {"encoder_type": "croco", "img_size": 512, "patch_size": 16, "patch_embed_cls": "ManyAR_PatchEmbed"}
+    modes = {"depth_mode": ("exp", -math.inf, math.inf), "conf_mode": ("exp", 1, math.inf)}
+    return {
+        "encoder_args": encoder | small | {"depth": 1, "pos_embed": "RoPE100"},
+        "decoder_args": {"random_image_idx_embedding": True, "enc_embed_dim": 32, "depth": 10} | small,
+        "head_args": modes
+        | {"head_type": "dpt", "output_mode": "pts3d", "patch_size": 16, "landscape_only": True}
+        | {"with_local_head": True},
+    }
 
 
 def _two_layers(*ends: int) -> range:
