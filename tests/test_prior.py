@@ -215,7 +215,7 @@ def test_poses_that_drift_are_a_prior_unless_asked_otherwise() -> None:
 def test_a_prior_that_cannot_serve_is_refused(changes: dict[str, object], why: str) -> None:
     with pytest.raises(OptionError, match=why):
         check_buildable(info(**changes), BuildSettings(reconstruction="rgbd", poses="prior"))
-    with pytest.raises(OptionError, match="of --reconstruction rgbd, not of sfm"):
+    with pytest.raises(OptionError, match="needs --reconstruction rgbd, not sfm"):
         check_buildable(info(), BuildSettings(reconstruction="sfm", poses="prior"))
 
 

@@ -32,6 +32,7 @@ from list3r.memory.errors import OptionError, SourceError
 
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "")
 _FISHEYE = "OPENCV_FISHEYE"
+_MOST_LOOKED_AT = 20_000
 _LENS = {False: ("k1", "k2", "p1", "p2", "k3"), True: ("k1", "k2", "k3", "k4")}
 """Names of the lens's numbers, of a pinhole camera and of a fisheye."""
 
@@ -128,8 +129,10 @@ def _file(root: Path, path: Path, row: Mapping[str, Any], turned: bool) -> Frame
     )
 
 
-def _not_named(files: Iterable[FrameFile]) -> int:
-    """Return how many pictures lie beside those of the frames."""
+def _not_named(files: Sequence[FrameFile]) -> int:
+    """Return how many pictures lie beside those of the frames; 0 of so many frames that a look takes long."""
+    if len(files) > _MOST_LOOKED_AT:
+        return 0
     named = {file.color for file in files if isinstance(file.color, Path)}
     there = {p for folder in {p.parent for p in named} if folder.is_dir() for p in folder.iterdir()}
     other = {file.mask for file in files} | {file.depth for file in files}
