@@ -146,6 +146,15 @@ def test_small_shifts_add_up_over_several_ends(store: Store) -> None:
     check(store)
 
 
+def test_a_chunk_that_was_measured_anew_is_derived_among_those_that_are_carried(store: Store) -> None:
+    with store.transaction():
+        store.library.unsettle(CHUNKS)
+    written = end(store, {k: bent(k) for k in range(1, CHUNKS + 1)})
+    assert written
+    assert {o.chunk_id for n in written for o in store.observations.of(n)} <= set(range(CHUNKS - 4, CHUNKS + 1))
+    check(store)
+
+
 def test_a_walk_goes_on_from_where_it_was_carried(walks: ModuleType, store: Store) -> None:
     assert end(store, {k: bent(k) for k in range(1, CHUNKS + 1)}) == frozenset()
     add(store, visit(walks, CHUNKS, CHUNKS), bent(CHUNKS))

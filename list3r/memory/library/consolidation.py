@@ -92,7 +92,7 @@ def consolidate(
     report = report if report.written is None else replace(report, written=report.written | followed)
     if not whole and known is not None and world.light != known.light:
         _describe_anew(region)
-    if ended and not dirty.whole:
+    if ended and not dirty.whole and carried is None:
         put_exactly(store, {k: region.pose(k) for k in region.settled}, report.written or ())
     store.facts[WORLD] = replace(world, edits=last_edit(store))
     store.library.touched = set()

@@ -140,9 +140,9 @@ def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[i
 def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None) -> None:
     """Carry instances along with the chunks that they hang on: `moves` lead by chunk from where it was settled in the
     world to where it lies. Boxes in the component that is `upright` stay so; a box along the axes grows or shrinks as
-    the one round the turned box does.
+    the one round the turned box does. What hangs on another chunk, which was measured anew, is left to be derived.
     """
-    anchors = store.library.anchors.all()
+    anchors = {n: a for n, a in store.library.anchors.all().items() if a.chunk_id in moves}
     for some in _batches(sorted(anchors)):
         instances = store.instances.of(some)
         exact = stacked([anchors[i.id].S_exact_settled for i in instances])

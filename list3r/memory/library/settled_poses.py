@@ -264,7 +264,7 @@ def _near_otherwise(
     near = {k: row for k, row in near.items() if k not in redundant}
     extents = np.array([r.extent for r in near.values()]).reshape(-1, 2, 3)
     now = {(k, n) for k in near for n in neighbours(near, k, extents=extents) if n > k}
-    before = {(u, v) for u, v in store.library.overlaps.pairs(list(near)) if u < v}
+    before = {(u, v) for u, v in store.library.overlaps.pairs(list(near)) if u < v and u in near and v in near}
     apart, together = before - now, sorted(now - before)
     strange = {k for p in apart if store.library.overlaps.get(p) for k in p}
     shift, _ = _between(by, boxes[0], np.searchsorted(ids, np.array(together, np.int64).reshape(-1, 2)))
