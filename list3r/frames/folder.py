@@ -8,6 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal
+from list3r.frames.later import LazyFrame
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.leftovers import not_read
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
@@ -93,11 +95,23 @@ class FolderSource:
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
         for position in range(len(self._chosen))[start:stop:step]:
+            yield self._read(self._number(position))
+
+    def read_some(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but frames at positions that are no multiple of `step` are read when they are looked at."""
+        for position in range(len(self._chosen))[start:stop]:
             number = self._number(position)
-            try:
-                yield self._frame(number)
-            except FrameError as error:
-                yield BadFrame(number, str(error))
+            if position % step:
+                file = self._layout.files[number]
+                yield LazyFrame(number, self._time_s(number, file), self._pose(file), partial(self._read, number))
+            else:
+                yield self._read(number)
+
+    def _read(self, number: int) -> Frame | BadFrame:
+        try:
+            return self._frame(number)
+        except FrameError as error:
+            return BadFrame(number, str(error))
 
     def position(self, index: int) -> int:
         """Return where a frame (Frame.index) is among those handed out."""

@@ -101,8 +101,8 @@ class BuildRequest:
     depth_every: int | None = field(
         default=None,
         metadata=option(
-            "With colour alone: depth and things from every n-th frame, the others get a pose; default: by how fast "
-            "the picture moves.",
+            "With colour alone or a depth sensor: depth and things from every n-th frame, the others get a pose; "
+            "default: by how fast the picture moves.",
             "N",
         ),
     )

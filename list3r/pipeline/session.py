@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from list3r.frames.base import FrameSource, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
-from list3r.frames.chunking.pace import depth_step
+from list3r.frames.chunking.pace import PaceSettings, depth_step
 from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import SourceOptions, check_bad_share, open_source
 from list3r.instances.registry import check_choice
@@ -304,10 +304,20 @@ def settled_step(store: Store, session: int, job: Job, watch: Watch) -> int:
         if known is None:
             begun = store.chunks.all(session)  # by a version that took all frames
             source, length = job.frames(), job.settings.chunks.length
-            known = 1 if begun else depth_step(source, length, job.settings.pace, progress=watch.looking("pace"))
+            known = 1 if begun else depth_step(source, length, _pace(job), progress=watch.looking("pace"))
         with store.transaction():
             store.sessions.put(replace(store.sessions.get(session), depth_step=known))
     return known
+
+
+def _pace(job: Job) -> PaceSettings:
+    """How many frames may be passed over: no more than the camera can be followed without, none of which is held."""
+    pace = job.settings.pace
+    if not entry(job.settings.reconstruction).skips:
+        return pace
+    how = job.settings.models.rgbd
+    gap = int(how.odometry.gap_s * job.info.fps)
+    return replace(pace, most=min(pace.most, how.most_step, max(1, gap)), most_mb=float("inf"))
 
 
 def note_lost(store: Store, session: int, result: ChunkResult) -> None:
@@ -353,8 +363,8 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; to take fewer frames use --every")
     if every is not None and every > 1 and not model.thins:
         raise OptionError(
-            f"--depth-every is of models that compute depth from colour (sfm), not of {settings.reconstruction}; leave "
-            "it out, or thin the frames with --every"
+            f"--depth-every is of sfm and rgbd, not of {settings.reconstruction}; leave it out, or thin the frames "
+            "with --every"
         )
     if model.needs_depth and not info.has_depth:
         raise OptionError(

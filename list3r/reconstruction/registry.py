@@ -46,7 +46,9 @@ class ModelEntry:
     calibration: str = ""
     """Module that estimates an unknown camera before the chunks, by `calibrate(source, settings)`."""
     thins: bool = False
-    """Computes depth, so that frames which show the same from nearly the same place need not all have it."""
+    """Can do with depth of some of the frames where all show the same from nearly the same place."""
+    skips: bool = False
+    """Need not look at frames between those that get depth, and has `thinned(frames, camera, deep)`."""
     maps_videos: bool = False
     """Has `placed(frames, camera, T_map_cam)` for chunks of a video that was mapped as a whole before."""
     by_cameras: bool = False
@@ -58,7 +60,9 @@ class ModelEntry:
 
 
 MODELS: dict[str, ModelEntry] = {
-    "rgbd": ModelEntry("rgbd.reconstructor", needs_depth=True, needs_camera=True, follows_prior=True),
+    "rgbd": ModelEntry(
+        "rgbd.reconstructor", needs_depth=True, needs_camera=True, follows_prior=True, thins=True, skips=True
+    ),
     "sfm": ModelEntry(
         "sfm.reconstructor", calibration="sfm.calibration", thins=True, maps_videos=True, by_cameras=True
     ),

@@ -49,8 +49,8 @@ def depth_step(
     """
     s = settings or PaceSettings()
     height, width = source.info.image_size or (480, 640)
-    room = int(s.most_mb * 2**20 / (3.0 * height * width * length))
-    most = min(s.most, source.info.frame_count // length, room)
+    room = s.most_mb * 2**20 / (3.0 * height * width * length)
+    most = int(min(s.most, source.info.frame_count // length, room))
     if most < 2:
         return 1
     flows = picture_flows(source, s, progress)

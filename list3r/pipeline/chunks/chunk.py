@@ -19,6 +19,7 @@ from list3r.association.overlap.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunking.borrowing import Borrowed, Repeat, borrow, frames_around
 from list3r.frames.chunking.chunks import ChunkSpan
+from list3r.frames.later import read_some
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
@@ -33,7 +34,7 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.learned import LearnedDetector, make_detector
 from list3r.reconstruction.keyframe_record import FrameLook, KeyframeNetworks, frame_samples, make_keyframes
-from list3r.reconstruction.registry import ModelOptions, import_model, make_reconstructor
+from list3r.reconstruction.registry import ModelOptions, entry, import_model, make_reconstructor
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     clock = _Clock()
     source = _source(task.path, task.options)
     camera = source.info.camera or guessed_camera(source.info)
-    read = list(source.read(task.span.start, task.span.stop))
+    read = _read(task, source)
     frames = [f for f in read if isinstance(f, Frame)]
     bad = tuple((f.index, f.reason) for f in read if isinstance(f, BadFrame))
     clock.mark("read")
@@ -83,6 +84,19 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
         made = _with_repeats(_with_between(made, part.between, used), repeats)
         results.append(made if last else replace(made, index=task.span.index + number * PART_STEP))
     return tuple(results)
+
+
+def _read(task: ChunkTask, source: FrameSource) -> list[Frame | BadFrame]:
+    """The frames of the chunk, of models that need not look at all of them some that are read when they are.
+
+    Where one cannot be decoded all are read, so that it is known how many.
+    """
+    start, stop = task.span.start, task.span.stop
+    if task.depth_every > 1 and entry(task.settings.reconstruction).skips:
+        some = list(read_some(source, start, stop, task.depth_every))
+        if not any(isinstance(frame, BadFrame) for frame in some):
+            return some
+    return list(source.read(start, stop))
 
 
 def get_ready(settings: BuildSettings) -> None:
@@ -144,7 +158,9 @@ def _parts(
     model: Reconstructor, frames: Sequence[Frame], camera: Camera, around: Around | None, deep: Collection[int] | None
 ) -> Sequence[Reconstruction]:
     """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
-    parts = getattr(model, "parts", None)
+    parts, thinned = getattr(model, "parts", None), getattr(model, "thinned", None)
+    if deep is not None and thinned is not None:
+        return [thinned(frames, camera, deep)]
     return [model(frames, camera)] if parts is None else parts(frames, camera, around, deep)
 
 

@@ -9,7 +9,7 @@ is left out (decision 0063).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
+from list3r.frames.later import LazyFrame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
 from list3r.reconstruction.motion.movers import Mask, MoverMemory, find_mover, fit, without
 from list3r.reconstruction.poses import angle_deg, shows_more
@@ -42,6 +43,10 @@ class TrackedSegment:
     """Share of inliers that the last frames had."""
 
 
+class _LookCloserError(Exception):
+    """A frame is not found from the last one that was followed: those between are needed."""
+
+
 class CameraTracker:
     """Follows one chunk. `segments` holds the outcome, in order of time."""
 
@@ -53,17 +58,22 @@ class CameraTracker:
         known: Mapping[int, Mask] | None = None,
         *,
         prior: bool = False,
+        between: Collection[int] = (),
     ) -> None:
         """`known` are masks of any size, by position, of what is known to move: the camera is followed without it.
 
-        With `prior` the frames' own poses say roughly how the camera moves.
+        With `prior` the frames' own poses say roughly how the camera moves. Frames at the positions `between` are
+        passed over where the next one that is not among them is found without them.
         """
         self.frames, self.camera, self.settings = frames, camera, settings
         self.small = camera.shrunk(settings.working_width)
         self.segments: list[TrackedSegment] = []
+        self.passed: list[list[int]] = []
+        """Positions of frames that were not looked at, in runs between two that were."""
         self.cosines: dict[int, Floats] = {}
         """How the surfaces of each frame with depth are faced, by position. Shape (h, w) each."""
-        self._prior = prior
+        self._prior, self._between = prior, frozenset(between)
+        self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
         self._views: dict[int, WorkingFrame] = {}
         self._moving: dict[int, Mask] = {}
@@ -78,8 +88,28 @@ class CameraTracker:
     def run(self) -> list[TrackedSegment]:
         """Follow all frames, then join the segments that can be joined; the largest comes first."""
         for position in range(len(self.frames)):
-            self._step(position)
+            if position in self._between and self.segments:
+                self._waiting.append(position)
+                continue
+            try:
+                self._step(position)
+            except _LookCloserError:
+                self._step_all([*self._take_waiting(), position])
+            if self._waiting:
+                self.passed.append(self._take_waiting())
+        self._step_all(self._take_waiting())
         return self._join()
+
+    def _take_waiting(self) -> list[int]:
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+    def _step_all(self, positions: Sequence[int]) -> None:
+        for position in positions:
+            self._step(position)
+            frame = self.frames[position]
+            if isinstance(frame, LazyFrame):
+                frame.let_go()
 
     def view(self, position: int) -> WorkingFrame:
         """Return the frame at working resolution, without what moves of its own."""
@@ -295,7 +325,12 @@ class CameraTracker:
         )
 
     def _search(self, segment: TrackedSegment, position: int, nearby: bool) -> FrameRegistration | None:
-        """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`."""
+        """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`.
+
+        Raises `_LookCloserError` where frames before it were passed over.
+        """
+        if self._waiting:
+            raise _LookCloserError
         last = max(segment.T_segment_cam)
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
         guesses = [(segment.T_segment_cam[k], self._feature_guess(k, position)) for k in known]

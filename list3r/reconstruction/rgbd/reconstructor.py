@@ -6,8 +6,9 @@ together (`odometry`, `registration`, `surfels`); local features find frames aga
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import OptionError, TrackingError
-from list3r.reconstruction.base import Reconstruction
+from list3r.reconstruction.base import PosedOnly, Reconstruction
 from list3r.reconstruction.motion.follow import follow_movers
 from list3r.reconstruction.motion.moving import SmallFrames, find_moving
 from list3r.reconstruction.poses import given_poses, select_keyframes
@@ -25,6 +26,8 @@ from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker
 from list3r.reconstruction.rgbd.settings import RgbdSettings
 from list3r.reconstruction.rgbd.view import Floats
+
+T_ = TypeVar("T_")
 
 
 def make(options: ModelOptions) -> RgbdReconstructor:
@@ -54,42 +57,57 @@ class RgbdReconstructor:
         Raises `TrackingError` when the frames have no depth, when no given pose is valid, or when no two frames can
         be related.
         """
-        if not any(frame.depth is not None for frame in frames):
+        return self.thinned(frames, camera, {frame.index for frame in frames})
+
+    def thinned(self, frames: Sequence[Frame], camera: Camera, deep: Collection[int]) -> Reconstruction:
+        """Reconstruct a chunk of which only the frames of the numbers `deep` get depth, and the others a pose.
+
+        Those others are looked at only where the camera cannot be followed without them. Raises as above.
+        """
+        used = [k for k, frame in enumerate(frames) if frame.index in deep]
+        shown = [frames[k] for k in used]
+        if not any(frame.depth is not None for frame in shown):
             raise TrackingError("the frames have no depth; the rgbd reconstruction needs it")
-        shape = (camera.height, camera.width)
-        depth = np.zeros((len(frames), *shape), np.float32)
-        for k, frame in enumerate(frames):
+        depth = np.zeros((len(shown), camera.height, camera.width), np.float32)
+        for k, frame in enumerate(shown):
             if frame.depth is not None:
                 depth[k] = frame.depth
         faced: Mapping[int, Floats] = {}
         if self.poses == "given":
             T, posed = given_poses(frames)
-            keyframes = select_keyframes(T, posed, [f.depth for f in frames], self.settings.odometry.keyframes)
-            moving = self._moving(frames, T, posed, camera, {})
+            moving = self._moving(shown, T[used], posed[used], camera, {})
         else:
-            T, posed, keyframes, tracker = self._estimate(frames, camera)
-            moving = self._moving(frames, T, posed, camera, tracker.moving)
+            T, posed, keyframes, tracker = self._estimate(frames, camera, used)
+            moving = self._moving(shown, T[used], posed[used], camera, _among(tracker.moving, used))
             if moving is not None:
-                known = {k: _rim(m > 0) for k, m in enumerate(moving) if m.any()}
-                T, posed, keyframes, tracker = self._estimate(frames, camera, known)
-                moving = self._moving(frames, T, posed, camera, tracker.moving)
-            faced = tracker.cosines
+                known = {used[k]: _rim(m > 0) for k, m in enumerate(moving) if m.any()}
+                T, posed, keyframes, tracker = self._estimate(frames, camera, used, known)
+                moving = self._moving(shown, T[used], posed[used], camera, _among(tracker.moving, used))
+            faced = _among(tracker.cosines, used)
+        if not posed[used].any():
+            raise TrackingError(f"the camera is not found in frames {frames[0].index} to {frames[-1].index}")
+        if self.poses == "given" or len(used) < len(frames):
+            depths = [frame.depth for frame in shown]
+            keyframes = select_keyframes(T[used], posed[used], depths, self.settings.odometry.keyframes)
         if moving is not None:
             _take_out(depth, moving)
             faced = {k: cosine for k, cosine in faced.items() if not moving[k].any()}
         confidence = np.zeros(depth.shape, np.float16)
         for k, image in enumerate(depth):
             confidence[k] = depth_confidence(image, camera, self.settings.confidence, faced.get(k))
+        indices = np.array([frame.index for frame in frames], np.int64)
+        rest = np.setdiff1d(np.arange(len(frames)), used)
         return Reconstruction(
-            frame_indices=np.array([frame.index for frame in frames], np.int64),
-            posed=posed,
-            T_chunk_cam=T,
+            frame_indices=indices[used],
+            posed=posed[used],
+            T_chunk_cam=T[used],
             camera=camera,
             depth=depth,
             confidence=confidence,
             scale_kind="metric",
             keyframes=np.array(keyframes, np.int64),
             moving=moving,
+            between=PosedOnly(indices[rest], posed[rest], T[rest]) if len(rest) else None,
         )
 
     def _moving(
@@ -109,10 +127,19 @@ class RgbdReconstructor:
         return follow_movers(masks, [f.color for f in frames], times_s, small, self.settings.follow)
 
     def _estimate(
-        self, frames: Sequence[Frame], camera: Camera, known: Mapping[int, NDArray[np.bool_]] | None = None
+        self,
+        frames: Sequence[Frame],
+        camera: Camera,
+        used: Sequence[int],
+        known: Mapping[int, NDArray[np.bool_]] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], CameraTracker]:
-        """Poses, which frames have one, keyframes, and what followed the camera; without what `known` holds."""
-        tracker = CameraTracker(frames, camera, self.settings.odometry, known, prior=self.poses == "prior")
+        """Poses, which frames have one, keyframes, and what followed the camera; without what `known` holds.
+
+        Of frames that are not `used` (positions) only those are looked at without which it cannot be followed.
+        """
+        how = self.settings.odometry
+        between = set(range(len(frames))) - set(used)
+        tracker = CameraTracker(frames, camera, how, known, prior=self.poses == "prior", between=between)
         segments = tracker.run()
         if not segments or (len(segments[0].T_segment_cam) < 2 and len(frames) > 1):
             raise TrackingError(
@@ -123,12 +150,37 @@ class RgbdReconstructor:
         for position, pose in segments[0].T_segment_cam.items():
             T[position], posed[position] = pose, True
         T[posed] = np.linalg.inv(T[int(np.flatnonzero(posed)[0])]) @ T[posed]
+        _pose_passed(T, posed, tracker.passed, [frame.time_s for frame in frames])
         if self.poses == "prior":
             given = stacked([f.T_source_cam for f in frames])
             T_source_chunk = source_from_chunk(T, posed, given, self.settings.odometry.prior)
             T, posed = bridged(T, posed, given, self.settings.odometry.prior)
             T[posed] = T[posed] if T_source_chunk is None else T_source_chunk @ T[posed]
         return T, posed, segments[0].keyframes, tracker
+
+
+def _pose_passed(
+    T: NDArray[np.float64], posed: NDArray[np.bool_], passed: Sequence[Sequence[int]], times_s: Sequence[float]
+) -> None:
+    """Pose frames that were passed over, in place, by a steady motion between the two frames beside each run of them.
+
+    `T` (F, 4, 4) and `posed` (F,) are of all frames.
+    """
+    for run in passed:
+        before, after = run[0] - 1, run[-1] + 1
+        if not (posed[before] and posed[after]):
+            continue
+        step = np.linalg.inv(T[before]) @ T[after]
+        turn, whole_s = cv2.Rodrigues(step[:3, :3])[0], times_s[after] - times_s[before]
+        for position in run:
+            share, part = (times_s[position] - times_s[before]) / whole_s, np.eye(4)
+            part[:3, :3], part[:3, 3] = cv2.Rodrigues(share * turn)[0], share * step[:3, 3]
+            T[position], posed[position] = T[before] @ part, True
+
+
+def _among(rows: Mapping[int, T_], used: Sequence[int]) -> dict[int, T_]:
+    """What is known of frames by position, of those that are used, by their place among them."""
+    return {place: rows[k] for place, k in enumerate(used) if k in rows}
 
 
 def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

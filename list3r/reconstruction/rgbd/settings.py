@@ -129,3 +129,5 @@ class RgbdSettings:
     confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
     moving: MovingSurfaceSettings = field(default_factory=MovingSurfaceSettings)
     follow: FollowSettings = field(default_factory=FollowSettings)
+    most_step: int = 2
+    """Largest step between frames of a slow video that get depth, unless another is asked for (decision 0159)."""
