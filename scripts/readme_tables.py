@@ -198,10 +198,9 @@ def discovery() -> str:
     }
     keys = {"boxes at IoU 0.25": ("", "0.25"), "at 0.5": ("", "0.5"), "masks at 0.25": ("mask_", "0.25")}
     keys["masks at 0.5"] = ("mask_", "0.5")
-    rows, rules = [], _read("discovery-rules")
+    rows = []
     for name, place in places.items():
-        before = {"geometric": rules[name]["mean"]} if name in rules else {}
-        for method, entry in (before | _read(name)["mean"]).items():
+        for method, entry in _read(name)["mean"].items():
             cells = [
                 f"{entry[f'{kind}recall_{iou}']:.2f}, {entry[f'{kind}precision_{iou}']:.2f}"
                 for kind, iou in keys.values()

@@ -20,7 +20,6 @@ from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
 from list3r.instances.learned.doubt import DoubtSettings, voxel_doubt, without_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
 from list3r.instances.learned.network import Weights
-from list3r.instances.learned.standing import StandingSettings, with_supports
 from list3r.instances.learned.things import ThingVerdicts, names_of
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
@@ -50,7 +49,6 @@ class LearnedSettings:
     plane_area_m2: float = 0.25
     """Smallest flat surface looked for, from which gravity is told and structure is parted."""
     cut: CutSettings = field(default_factory=CutSettings)
-    standing: StandingSettings | None = field(default_factory=StandingSettings)
     doubt: DoubtSettings = field(default_factory=DoubtSettings)
     """Of computed depth."""
 
@@ -92,9 +90,6 @@ class LearnedDiscoverer(CloudDiscoverer):
         if around.computed:
             cut = self._as_sure_as_depth(views, surface, cut, planes)
         listed = (cut.told.whole >= self._learned.least_confidence) | (cut.told.structure > 0.5)
-        if self._learned.standing is not None:
-            cut = with_supports(surface, cut, listed, self._learned.standing)
-            listed = (cut.told.whole >= self._learned.least_confidence) | (cut.told.structure > 0.5)
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(self._weights)
         kept, features = _described(cloud, parted, up, views.unit, names)
