@@ -62,7 +62,7 @@ def test_regions_are_instances_and_blocks_of_the_rest() -> None:
     assert regions.count.sum() == len(pairs)
 
 
-def test_delta_is_the_papers_and_along_sees_what_it_cannot() -> None:
+def test_what_moves_along_its_rays_is_caught_though_delta_is_zero() -> None:
     """A thing pushed along its rays has no pixel residual in the frames themselves."""
     u, v = film((*BOXES, PERSON)), film((*BOXES, PERSON), S_V, mover_depth=1.2)
     pairs = shared_pairs(u, v)
@@ -73,7 +73,6 @@ def test_delta_is_the_papers_and_along_sees_what_it_cannot() -> None:
     mover = int(np.flatnonzero(regions.label == MOVER)[0])
     assert found.delta_px.max() < 0.1
     assert found.moving[mover]
-    assert np.isclose(found.along[mover], 1 / 6, atol=0.02)
     assert found.moving.sum() == 1
 
 

@@ -109,7 +109,7 @@ def test_a_folder_of_others_is_refused_and_parts_stand_apart(room: Path, tmp_pat
     with list3r.open(room) as memory:
         with pytest.raises(ExportError, match="holds other files"):
             memory.export("colmap", tmp_path / "mine")
-        with pytest.raises(OptionError, match="color goes with ply and glb, not with colmap"):
+        with pytest.raises(OptionError, match="color belongs to ply and glb, not to colmap"):
             memory.export("colmap", tmp_path / "c", color="rgb")
     with list3r.open(write_split_memory(tmp_path / "split.l3r")) as memory:
         written = {p.relative_to(tmp_path / "c").as_posix() for p in memory.export("colmap", tmp_path / "c")}

@@ -233,7 +233,7 @@ def test_what_has_no_frames_of_its_own_is_not_inspected(source: str) -> None:
 
 
 def test_what_is_no_live_source_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no folder"):
+    with pytest.raises(SourceError, match="is not a folder"):
         build_live(tmp_path / "none", tmp_path / "m.l3r", run=RunOptions(live=True))
     with pytest.raises(OptionError, match="cannot be resumed"):
         build_live(tmp_path, tmp_path / "m.l3r", run=RunOptions(live=True, resume=True))
