@@ -19,7 +19,7 @@ from list3r.memory.geometry import rotation_exp
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings
-from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
+from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor, _pose_passed
 from tests.rgbd_scenes import CAMERA, render
 
 COUNT = 22
@@ -76,6 +76,12 @@ def test_a_slow_camera_is_followed_without_most_frames() -> None:
     order = np.argsort([*made.frame_indices, *made.between.frame_indices])
     T = np.concatenate([made.T_chunk_cam, made.between.T_chunk_cam])[order]
     assert errors_m(T, reels.poses).max() < 0.006
+
+
+def test_where_a_clock_stands_still_what_is_passed_over_lies_in_the_middle() -> None:
+    T, posed = np.stack([pose(0), np.eye(4), pose(2)]), np.array([True, False, True])
+    _pose_passed(T, posed, [[1]], [0.5, 0.5, 0.5])
+    assert posed.all() and np.allclose(T[1, :3, 3], (T[0] + T[2])[:3, 3] / 2, atol=1e-5)
 
 
 def test_what_is_passed_over_is_looked_at_where_the_camera_is_lost_without_it() -> None:

@@ -164,7 +164,7 @@ def _pose_passed(
 ) -> None:
     """Pose frames that were passed over, in place, by a steady motion between the two frames beside each run of them.
 
-    `T` (F, 4, 4) and `posed` (F,) are of all frames.
+    Where a clock stands still they lie in the middle. `T` (F, 4, 4) and `posed` (F,) are of all frames.
     """
     for run in passed:
         before, after = run[0] - 1, run[-1] + 1
@@ -173,7 +173,8 @@ def _pose_passed(
         step = np.linalg.inv(T[before]) @ T[after]
         turn, whole_s = cv2.Rodrigues(step[:3, :3])[0], times_s[after] - times_s[before]
         for position in run:
-            share, part = (times_s[position] - times_s[before]) / whole_s, np.eye(4)
+            share = (times_s[position] - times_s[before]) / whole_s if whole_s > 0 else 0.5
+            part = np.eye(4)
             part[:3, :3], part[:3, 3] = cv2.Rodrigues(share * turn)[0], share * step[:3, 3]
             T[position], posed[position] = T[before] @ part, True
 
