@@ -5,10 +5,11 @@ python benchmarks/association.py --quick --json FILE        # two presets, two s
 
 A run that was ended goes on where it was when it is started again with the same `--json` and commit.
 
-The presets opposite, night, alike, moved and halls are videos in which a place is seen again but looks otherwise
-(`benchmarks.simulation.returns`), with masks as discovery makes them in homes that it never saw. The simulated network
-relates places that share no surface by laying look-alike things on one another, which is right where they are the same
-things; with `--joint surfaces` it relates only what shares surfaces, and else takes the camera not to have moved.
+The presets opposite, night, alike, moved, halls and seasons are videos in which a place is seen again but looks
+otherwise (`benchmarks.simulation.returns`), with masks as discovery makes them in homes that it never saw. The
+simulated network relates places that share no surface by laying look-alike things on one another, which is right where
+they are the same things; with `--joint surfaces` it relates only what shares surfaces, and else takes the camera not to
+have moved.
 
 Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
 model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video,
@@ -49,7 +50,7 @@ from list3r.pipeline.workers import OrderedPool
 
 Array = NDArray[np.float64]
 PRESETS = ("calm", "loop", "kidnap", "dynamic", "twins", "sparse", "corridor")
-RETURNS = ("opposite", "night", "alike", "moved", "halls")
+RETURNS = ("opposite", "night", "alike", "moved", "halls", "seasons")
 TITLES = {
     "vggt-long": "VGGT-Long as published",
     "vggt-long-cuts": "VGGT-Long, cuts given",
@@ -336,13 +337,12 @@ class _Truth:
         from list3r.memory.geometry import umeyama
 
         video, near = self._video, np.abs(samples.frame - frame) <= 10
-        index, pixel, camera = samples.frame[near], samples.pixel[near], video.camera
-        row, column = pixel // camera.width, pixel % camera.width
-        z = video.depth[index, row, column].astype(np.float64)
-        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
-        T = video.T_world_cam[index]
-        points = np.einsum("nij,nj->ni", T[:, :3, :3], z[:, None] * rays) + T[:, :3, 3]
-        known = (z > 0) & ~np.isin(video.ids[index, row, column], [m.id for m in video.movers])
+        index = samples.frame[near]
+        row, column = np.divmod(samples.pixel[near], video.camera.width)
+        points = video.points(index, row, column)
+        known = (video.depth[index, row, column] > 0) & ~np.isin(
+            video.ids[index, row, column], [m.id for m in video.movers]
+        )
         try:
             found = umeyama(samples.points[near][known], points[known], with_scale=True)
             off = np.linalg.norm(found.apply(samples.points[near][known]) - points[known], axis=1)
@@ -393,15 +393,10 @@ def _points(store: Any) -> Array:
 
 def _true_cloud(video: Any) -> Array:
     """Every tenth frame's surface, movers left out, thinned to a grid of 2 cm."""
-    camera, points = video.camera, []
-    moving = [m.id for m in video.movers]
-    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
-    for k in range(0, len(video.depth), 10):
-        keep = (video.depth[k] > 0) & ~np.isin(video.ids[k], moving)
-        T = video.T_world_cam[k]
-        points.append((video.depth[k][..., None] * rays)[keep] @ T[:3, :3].T + T[:3, 3])
-    cloud = np.concatenate(points)
+    seen = np.arange(0, len(video.depth), 10)
+    keep = (video.depth[seen] > 0) & ~np.isin(video.ids[seen], [m.id for m in video.movers])
+    k, row, column = np.nonzero(keep)
+    cloud = video.points(seen[k], row, column)
     _, first = np.unique(np.floor(cloud / 0.02).astype(np.int64), axis=0, return_index=True)
     return cloud[np.sort(first)]
 

@@ -23,7 +23,7 @@ from machine import write_json
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-OLD, RETURNS = "calm,loop,kidnap,dynamic,twins,sparse,corridor", "opposite,night,moved,alike,halls"
+OLD, RETURNS = "calm,loop,kidnap,dynamic,twins,sparse,corridor", "opposite,night,moved,alike,halls,seasons"
 APART, REVISIT, NONE, FOUND = 100, 0.30, 0.05, 0.10
 """Frames between the two of a pair; shares of surface of a revisit, of none, and of what counts as found."""
 LEAST_PX = 300

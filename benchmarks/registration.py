@@ -201,13 +201,10 @@ def to_truth(video: Any, samples: Any) -> Any:
     """The similarity that lays a chunk's samples on the world best."""
     from list3r.memory.geometry import umeyama
 
-    camera = video.camera
-    row, column = np.divmod(samples.pixel, camera.width)
-    z = video.depth[samples.frame, row, column].astype(np.float64)
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
-    T = video.T_world_cam[samples.frame]
-    there = np.einsum("nij,nj->ni", T[:, :3, :3], z[:, None] * rays) + T[:, :3, 3]
-    here, there = samples.points[z > 0].astype(np.float64), there[z > 0]
+    row, column = np.divmod(samples.pixel, video.camera.width)
+    known = video.depth[samples.frame, row, column] > 0
+    there = video.points(samples.frame, row, column)[known]
+    here = samples.points[known].astype(np.float64)
     off = np.linalg.norm(umeyama(here, there, with_scale=True).apply(here) - there, axis=1)
     good = off < 2 * np.median(off)
     return umeyama(here[good], there[good], with_scale=True)

@@ -109,13 +109,12 @@ class Truth:
         """The similarity from the truth to a chunk by all that the chunk saw and that stands still, trimmed."""
         from list3r.memory.geometry import umeyama
 
-        video, camera = self._video, self._video.camera
-        row, column = samples.pixel // camera.width, samples.pixel % camera.width
-        z = video.depth[samples.frame, row, column].astype(np.float64)
-        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
-        T = video.T_world_cam[samples.frame]
-        truth = np.einsum("nij,nj->ni", T[:, :3, :3], z[:, None] * rays) + T[:, :3, 3]
-        still = (z > 0) & ~np.isin(video.ids[samples.frame, row, column], [m.id for m in video.movers])
+        video = self._video
+        row, column = np.divmod(samples.pixel, video.camera.width)
+        truth = video.points(samples.frame, row, column)
+        still = (video.depth[samples.frame, row, column] > 0) & ~np.isin(
+            video.ids[samples.frame, row, column], [m.id for m in video.movers]
+        )
         points, truth, good = samples.points[still].astype(np.float64), truth[still], np.ones(int(still.sum()), bool)
         for _ in range(5):
             found = umeyama(truth[good], points[good], with_scale=True)

@@ -6,13 +6,16 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from benchmarks.feedforward_sim.descriptors import Appearance
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
 from benchmarks.feedforward_sim.pose_errors import PoseErrorSettings, bend
 from benchmarks.feedforward_sim.runs import runs_of
+from benchmarks.simulation.covisibility import covisibility
 from benchmarks.simulation.presets import make_video
+from benchmarks.simulation.returns import make_return
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.memory.errors import OptionError
@@ -34,12 +37,8 @@ def twins() -> SimulatedVideo:
 
 
 def true_points(video: SimulatedVideo, s: FrameSamples) -> np.ndarray:
-    camera = video.camera
-    row, column = np.divmod(s.pixel, camera.width)
-    z = video.depth[s.frame, row, column]
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1)
-    T = video.T_world_cam[s.frame]
-    return np.einsum("nij,nj->ni", T[:, :3, :3], z[:, None] * rays) + T[:, :3, 3]
+    row, column = np.divmod(s.pixel, video.camera.width)
+    return video.points(s.frame, row, column)
 
 
 def still(video: SimulatedVideo, s: FrameSamples) -> np.ndarray:
@@ -89,6 +88,34 @@ def test_exact_settings_give_the_truth_up_to_a_similarity(video: SimulatedVideo)
     assert abs(float(S.scale) - 1) > 1e-3
     assert np.all(chunk.samples.confidence == 1)
     assert len({float(fit(video, FeedForwardModel(video, seed=n).chunk(SPAN).samples)[0].scale) for n in range(3)}) == 3
+
+
+def test_two_cameras_in_one_window_see_the_same_room() -> None:
+    """Where a second camera takes over, its points lie on what the first one saw, in truth and in a window of both."""
+    video = make_return("seasons", 103)
+    cut = video.cuts[0]
+    assert video.later_camera is not None and video.later_camera.fx < 0.95 * video.camera.fx
+    rows, columns = (a.ravel() for a in np.mgrid[4:48:8, 4:64:8])
+    shared = covisibility(video, np.arange(0, cut, 5), np.arange(cut, len(video.time_s), 5))
+    first, second = (np.flatnonzero(shared.max(axis=1 - n) > 0.5) * 5 + n * cut for n in (0, 1))
+
+    def seen(frames: np.ndarray) -> np.ndarray:
+        return video.points(np.repeat(frames, len(rows)), np.tile(rows, len(frames)), np.tile(columns, len(frames)))
+
+    gap = cKDTree(seen(first)).query(seen(second))[0]
+    assert np.median(gap) < 0.1
+    u, v = (int(k) * 5 + n * cut for n, k in enumerate(np.unravel_index(np.argmax(shared), shared.shape)))
+    near_u, near_v = (
+        [f for f in range(u - 8, u + 9, 4) if 0 <= f < cut],
+        [f for f in range(v - 8, v + 9, 4) if f >= cut],
+    )
+    window = FeedForwardModel(video, FeedForwardSettings.exact(), seed=1)(0, near_u, 0, near_v)
+    assert window is not None
+    both = [np.concatenate([getattr(window.u, name), getattr(window.v, name)]) for name in ("points", "frame", "pixel")]
+    row, column = np.divmod(both[2], video.camera.width)
+    truth = video.points(both[1], row, column)
+    S = umeyama(both[0], truth, with_scale=True)
+    assert np.linalg.norm(S.apply(both[0]) - truth, axis=1).max() < 1e-3
 
 
 def test_exact_tracks_are_the_things_themselves(video: SimulatedVideo) -> None:

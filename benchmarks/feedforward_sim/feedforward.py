@@ -35,6 +35,7 @@ from benchmarks.feedforward_sim.mover_errors import MoverErrorSettings, mover_er
 from benchmarks.feedforward_sim.pose_errors import PoseErrorSettings, bend, jitter, placements, sides
 from benchmarks.simulation.covisibility import seen_share
 from benchmarks.simulation.video import SimulatedVideo
+from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3
@@ -90,7 +91,8 @@ class _Reconstructed:
 
     reconstruction: Reconstruction
     shift: Floats | None
-    """What to add to the points that depth gives, chunk units: things that move. Shape (F, H, W, 3)."""
+    """What to add to the points that depth gives by the one camera, chunk units: things that move, and frames of
+    another camera. Shape (F, H, W, 3)."""
 
 
 class FeedForwardModel:
@@ -163,7 +165,8 @@ class FeedForwardModel:
         S_chunk_cam = S_chunk_world @ Sim3.from_matrix(T_world_cam) @ own
         scale = S_chunk_cam.scale.astype(np.float32)[:, None, None]
         depth = scale * video.depth[frames] * factor * moving.depth_factor
-        camera, focal = video.camera, focal_factor(chosen.depth, seed)
+        (_, camera), *others = video.cameras(frames)
+        focal = focal_factor(chosen.depth, seed)
         reconstruction = Reconstruction(
             frame_indices=frames,
             posed=np.ones(len(frames), bool),
@@ -174,10 +177,16 @@ class FeedForwardModel:
             scale_kind="relative",
             keyframes=np.arange(0, len(frames), chosen.keyframe_step, dtype=np.int64),
         )
-        if moving.shift_m is None:
-            return _Reconstructed(reconstruction, None)
-        turn = (np.asarray(S_chunk_world.scale)[:, None, None] * S_chunk_world.rotation).astype(np.float32)
-        return _Reconstructed(reconstruction, np.einsum("fij,fhwj->fhwi", turn, moving.shift_m))
+        shift = None
+        if moving.shift_m is not None:
+            turn = (np.asarray(S_chunk_world.scale)[:, None, None] * S_chunk_world.rotation).astype(np.float32)
+            shift = np.einsum("fij,fhwj->fhwi", turn, moving.shift_m)
+        for where, other in others:
+            shift = np.zeros((*depth.shape, 3), np.float32) if shift is None else shift
+            shift[where] += _by_other_camera(
+                reconstruction, where, replace(other, fx=other.fx * focal, fy=other.fy * focal)
+            )
+        return _Reconstructed(reconstruction, shift)
 
     def _errors(self, frames: NDArray[np.int64], seed: list[int]) -> Sim3:
         """Where the model takes the part of the world that each frame sees to lie. Batched (F,)."""
@@ -224,6 +233,17 @@ class FeedForwardModel:
 def _rigid(transform: Sim3) -> NDArray[np.float64]:
     """Poses of cameras whose similarity is given; their scale goes into depth. Shape (F, 4, 4)."""
     return Sim3(np.ones_like(transform.scale), transform.rotation, transform.translation).as_matrix()
+
+
+def _by_other_camera(made: Reconstruction, where: NDArray[np.int64], camera: Camera) -> Floats:
+    """What to add to the points of frames that another camera filmed than the first. Shape (N, H, W, 3)."""
+    height, width = made.depth.shape[1:]
+    row, column = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    one, two = (
+        np.stack([(column - c.cx) / c.fx, (row - c.cy) / c.fy, np.ones(row.shape)], -1) for c in (made.camera, camera)
+    )
+    local = made.depth[where][..., None] * (two - one).astype(np.float32)
+    return np.asarray(np.einsum("fij,fhwj->fhwi", made.T_chunk_cam[where, :3, :3].astype(np.float32), local))
 
 
 def _part(made: _Reconstructed, which: slice) -> _Reconstructed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,23 +48,33 @@ def seen_share(
     moving = [mover.id for mover in video.movers]
     depth_a = np.where(np.isin(video.ids[a], moving), 0, video.depth[a]) if moving else video.depth[a]
     depth_b = np.where(np.isin(video.ids[b], moving), 0, video.depth[b]) if moving else video.depth[b]
-    return shared_view(depth_a, video.T_world_cam[a], depth_b, video.T_world_cam[b], video.camera, most_deg)
+    out = np.zeros((len(a), len(b)), np.float32)
+    for at_a, camera_a in video.cameras(a):
+        views_a = Views(depth_a[at_a], video.T_world_cam[a[at_a]], camera_a)
+        for at_b, camera_b in video.cameras(b):
+            views_b = Views(depth_b[at_b], video.T_world_cam[b[at_b]], camera_b)
+            out[np.ix_(at_a, at_b)] = shared_view(views_a, views_b, most_deg)
+    return out
 
 
-def shared_view(
-    depth_a: Floats,
-    T_world_a: Array,
-    depth_b: Floats,
-    T_world_b: Array,
-    camera: Camera,
-    most_deg: float = MOST_DEG,
-) -> Floats:
+@dataclass(frozen=True)
+class Views:
+    """Pictures of one camera."""
+
+    depth: Floats
+    """Metres, 0 for what does not count. Shape (N, H, W)."""
+    T_world_cam: Array
+    """Shape (N, 4, 4)."""
+    camera: Camera
+
+
+def shared_view(a: Views, b: Views, most_deg: float = MOST_DEG) -> Floats:
     """Share of the pixels with depth in each picture a whose points are seen in each picture b. Shape (A, B).
 
-    `depth_a` (A, H, W) and `depth_b` (B, H, W), metres, 0 for what does not count; `T_world_a` (A, 4, 4) and
-    `T_world_b` (B, 4, 4). A point is seen where its depth in b lies between the least and the greatest depth of the
-    3x3 pixels about it, 3 % added on either side, and where its two lines of sight differ by at most `most_deg`.
+    A point is seen where its depth in b lies between the least and the greatest depth of the 3x3 pixels about it, 3 %
+    added on either side, and where its two lines of sight differ by at most `most_deg`.
     """
+    depth_a, T_world_a, depth_b, T_world_b, camera = a.depth, a.T_world_cam, b.depth, b.T_world_cam, a.camera
     step = max(1, int(np.sqrt(camera.width * camera.height / _POINTS)))
     rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step].reshape(2, -1)
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(rows))], axis=1)
@@ -83,7 +94,7 @@ def shared_view(
         T_b_a = (T_b_world @ T_world_cam).astype(np.float32)
         points = np.asarray(rays[known] * z[known, None], dtype=np.float32)
         local = np.matmul(T_b_a[:, :3, :3], points.T) + T_b_a[:, :3, 3:]
-        seen = _seen(local, lower, upper, camera)
+        seen = _seen(local, lower, upper, b.camera)
         if most_deg < 180:
             unit = points / np.linalg.norm(points, axis=1, keepdims=True)
             cosine = np.einsum("bkn,bkn->bn", np.matmul(T_b_a[:, :3, :3], unit.T), local)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks.simulation.buildings import BuildingSettings, appearance_classes, make_building
 from benchmarks.simulation.casting import Caster
-from benchmarks.simulation.covisibility import shared_view
+from benchmarks.simulation.covisibility import Views, shared_view
 from benchmarks.simulation.movers import make_movers
 from benchmarks.simulation.routes import Director, FreeMap, View, mapped_view
 from benchmarks.simulation.takes import Shot, Take
@@ -256,10 +256,11 @@ class _Glimpse:
 
     def common(self, T_world_a: Array, T_world_b: Array, most_deg: float) -> NDArray[np.float32]:
         """Share of the picture that views have in common, the lesser of both directions. Shape (A, B)."""
-        depth_a, depth_b = (np.stack([self._caster.cast(T)[0] for T in poses]) for poses in (T_world_a, T_world_b))
-        forth = shared_view(depth_a, T_world_a, depth_b, T_world_b, self._camera, most_deg)
-        back = shared_view(depth_b, T_world_b, depth_a, T_world_a, self._camera, most_deg)
-        return np.minimum(forth, back.T)
+        a, b = (
+            Views(np.stack([self._caster.cast(T)[0] for T in poses]), poses, self._camera)
+            for poses in (T_world_a, T_world_b)
+        )
+        return np.minimum(shared_view(a, b, most_deg), shared_view(b, a, most_deg).T)
 
 
 def _near_view(take: Take, director: Director, poses: Array, frame: int) -> View | None:

@@ -6,7 +6,9 @@ Each has two runs with a cut between them. The first ends in some room, the seco
 - night: the same views in another light, which changes what things and pictures look like;
 - alike: in one of three rooms of one plan, which differ by the looks of three things each, and by where they stand;
 - moved: half of the furniture and of the small things moved in between, and the light changed;
-- halls: large bare halls with two or three things each.
+- halls: large bare halls with two or three things each;
+- seasons: a kitchen in another light, by another camera of another field of view, held at another height, after half of
+  the small things were moved.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from benchmarks.simulation.presets import preset_camera
 from benchmarks.simulation.routes import Director, FreeMap, View
 from benchmarks.simulation.takes import Take
 from benchmarks.simulation.video import SimulatedVideo
+from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
 from list3r.simulation.walk import PathSettings
 from list3r.simulation.worlds.things import SimulatedThing
@@ -36,11 +39,11 @@ from list3r.simulation.worlds.world import SimulatedWorld
 
 Array = NDArray[np.float64]
 
-RETURNS = ("opposite", "night", "alike", "moved", "halls")
+RETURNS = ("opposite", "night", "alike", "moved", "halls", "seasons")
 _KINDS = ("living room", "bedroom", "office", "kitchen", "meeting room", "storage")
 _STAYS = ("door", "door frame", "window", "picture", "whiteboard", "sink", "worktop", "wardrobe", "bookshelf")
 """What is not moved about."""
-_LIT = ("night", "moved")
+_LIT = ("night", "moved", "seasons")
 """Presets of which the second run has another light."""
 
 
@@ -61,15 +64,19 @@ def film_return(preset: str, seed: int) -> tuple[Take, SimulatedWorld | None]:
     building = _building(preset, seed, rng)
     pace = PathSettings(12.5, 0.6 * rng.uniform(0.85, 1.15), 42.0 * rng.uniform(0.85, 1.2))
     take = Take(building, FreeMap(building), rng, pace, float(rng.uniform(1.35, 1.6)))
-    room = building.north[int(rng.integers(len(building.north)))]
+    room = building.north[0 if preset == "seasons" else int(rng.integers(len(building.north)))]
     others = [r for r in building.north + building.south if r is not room]
     others = [others[k] for k in rng.permutation(len(others))]
     _film(take, preset, room, others)
-    return take, _rearranged(building.world, room, rng) if preset == "moved" else None
+    if preset not in ("moved", "seasons"):
+        return take, None
+    return take, _rearranged(building.world, room, rng, floor=preset == "moved")
 
 
 def _building(preset: str, seed: int, rng: np.random.Generator) -> Building:
     kinds = [_KINDS[k] for k in rng.permutation(len(_KINDS))]
+    if preset == "seasons":
+        kinds = ["kitchen", *(kind for kind in kinds if kind != "kitchen")]
     settings = {
         "alike": BuildingSettings((f"{kinds[0]}#a",) * 3, (kinds[1],)),
         "halls": BuildingSettings(("empty",) * 2, ("empty",), width_m=(7.0, 9.0), depth_m=(6.0, 7.5)),
@@ -101,7 +108,11 @@ def _rgb(rng: np.random.Generator) -> tuple[int, int, int]:
 
 def _film(take: Take, preset: str, room: PlacedRoom, others: list[PlacedRoom]) -> None:
     """Film two other rooms and at last this one; cut; this one again."""
-    first, second = take.director(), take.director()
+    later = take
+    if preset == "seasons":
+        pace = PathSettings(12.5, 0.6 * take.rng.uniform(0.85, 1.15), 42.0 * take.rng.uniform(0.85, 1.2))
+        later = replace(take, path=pace, eye_m=float(take.rng.uniform(1.2, 1.7)))
+    first, second = take.director(), later.director()
     for other in others[:2]:
         first.film(first.plan_views(other, 1, 130.0))
     if preset == "opposite":
@@ -115,8 +126,8 @@ def _film(take: Take, preset: str, room: PlacedRoom, others: list[PlacedRoom]) -
         views = first.plan_views(room, 2, 140.0)
         first.film(views)
         second.film([_near(second, room, view) for view in (*views, views[0])])
-    for director in (first, second):
-        take.shoot(director, round(director.seconds() * take.path.fps))
+    for run, director in ((take, first), (later, second)):
+        run.shoot(director, round(director.seconds() * run.path.fps))
 
 
 def _toward(director: Director, room: PlacedRoom, way: float) -> View:
@@ -143,8 +154,8 @@ def _near(director: Director, room: PlacedRoom, view: View) -> View:
     return View((float(spot[0]), float(spot[1])), view.targets)
 
 
-def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generator) -> SimulatedWorld:
-    """Return the world with half of what stands on floors or on furniture of a room put elsewhere in it."""
+def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generator, floor: bool) -> SimulatedWorld:
+    """Return the world with half of what stands on furniture, and on the `floor`, of a room put elsewhere in it."""
     things = {t.id: t for t in world.things}
     floors = [k for k in room.things if things[k].structure == "floor"]
     for k in room.things:
@@ -152,9 +163,12 @@ def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generato
         loose = thing.structure is None and thing.attached is None and thing.container is None
         if not loose or thing.label in _STAYS or rng.random() >= 0.5:
             continue
+        on_floor = thing.support is None or thing.support in floors
+        if on_floor and not floor:
+            continue
         carried = [t for t in things.values() if k in (t.support, t.container)]
         carried += [t for t in things.values() if t.container in {c.id for c in carried}]
-        moved = _elsewhere(thing, things, room, thing.support is None or thing.support in floors, rng)
+        moved = _elsewhere(thing, things, room, on_floor, rng)
         if moved is None:
             continue
         for t in (*carried, thing):
@@ -202,10 +216,20 @@ def _cast(preset: str, seed: int, take: Take, later: SimulatedWorld | None, size
     poses, cut = np.concatenate(take.poses), len(take.poses[0])
     depth = np.empty((len(poses), camera.height, camera.width), np.float32)
     ids = np.empty(depth.shape, np.int32)
-    casters = Caster(world.things, camera), Caster((later or world).things, camera)
+    other = _other_camera(camera, seed) if preset == "seasons" else None
+    casters = Caster(world.things, camera), Caster((later or world).things, other or camera)
     for k, pose in enumerate(poses):
         depth[k], ids[k] = casters[int(k >= cut)].cast(pose)
     light = (np.arange(len(poses)) >= cut).astype(np.int64) if preset in _LIT else None
     looks = appearance_classes(world.things)
     time_s = np.arange(len(poses)) / take.path.fps
-    return SimulatedVideo(preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), looks, light, later)
+    return SimulatedVideo(
+        preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), looks, light, later, other
+    )
+
+
+def _other_camera(camera: Camera, seed: int) -> Camera:
+    """Return a camera of the same picture size that sees 70 to 85 degrees across."""
+    across = np.deg2rad(np.random.default_rng([seed, 52]).uniform(70.0, 85.0))
+    focal = float(camera.width / (2 * np.tan(across / 2)))
+    return replace(camera, fx=focal, fy=focal)

@@ -47,6 +47,31 @@ class SimulatedVideo:
     """Which light each frame was filmed in; None where it is all the same. Shape (F,)."""
     later: SimulatedWorld | None = None
     """The world after the first cut, where things were moved in between."""
+    later_camera: Camera | None = None
+    """The camera after the first cut, of the same picture size, where it is another one."""
+
+    def cameras(self, frames: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], Camera]]:
+        """Return each camera that filmed some of the frames (N,), with the positions of its frames among them."""
+        if self.later_camera is None:
+            return [(np.arange(len(frames)), self.camera)]
+        after = frames >= self.cuts[0]
+        both = ((np.flatnonzero(~after), self.camera), (np.flatnonzero(after), self.later_camera))
+        return [(where, camera) for where, camera in both if len(where)]
+
+    def points(
+        self, frames: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return where the pixels of frames (N,) lie in the world, metres; the camera's place where nothing is hit.
+
+        Shape (N, 3).
+        """
+        z = self.depth[frames, row, column].astype(np.float64)
+        local = np.empty((len(frames), 3))
+        for where, c in self.cameras(frames):
+            rays = np.stack([(column[where] - c.cx) / c.fx, (row[where] - c.cy) / c.fy, np.ones(len(where))], axis=1)
+            local[where] = z[where, None] * rays
+        T = self.T_world_cam[frames]
+        return np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
 
     def lights(self) -> NDArray[np.int64]:
         """Return the light of each frame, 0 where it is all the same. Shape (F,)."""
