@@ -2,7 +2,8 @@
 
 Every variant measures the same edges, asks for the same joint windows and tests the same relations wherever its
 settings and what it found so far agree. These are functions of their arguments alone, so what one variant computed is
-what the next would; `tests/test_benchmark_shared_work.py` holds both to be equal.
+what the next would; `tests/test_benchmark_shared_work.py` holds both to be equal. Memory files, which live for one
+variant, are not compressed.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class SharedWork:
             for module, name in _PLACES:
                 original = getattr(import_module(module), name)
                 stack.enter_context(patch(f"{module}.{name}", self._once(f"{original.__module__}.{name}", original)))
+            stack.enter_context(patch("list3r.memory.store.rows.npz._LEVEL", 0))
             yield
 
     def _once(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:

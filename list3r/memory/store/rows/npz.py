@@ -22,6 +22,7 @@ _END = struct.Struct("<4s4H2LH")
 _MARKS = b"PK\x03\x04", b"PK\x01\x02", b"PK\x05\x06"
 _VERSION, _DEFLATED, _STORED, _FIRST_DAY = 20, 8, 0, 33
 """What the format calls them; the first of January 1980."""
+_LEVEL = zlib.Z_DEFAULT_COMPRESSION
 
 
 def write_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -32,7 +33,7 @@ def write_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     for key, array in arrays.items():
         assert array.dtype.kind in "biuf", f"{key} holds {array.dtype}"
         data = _header(array.dtype.str, array.shape) + array.tobytes()
-        packed = zlib.compress(data, wbits=-zlib.MAX_WBITS)
+        packed = zlib.compress(data, _LEVEL, wbits=-zlib.MAX_WBITS)
         name = f"{key}.npy".encode()
         told = _VERSION, 0, _DEFLATED, 0, _FIRST_DAY, zlib.crc32(data), len(packed), len(data), len(name), 0
         parts += [_LOCAL.pack(_MARKS[0], *told), name, packed]
