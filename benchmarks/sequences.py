@@ -140,7 +140,7 @@ def one_scene(root: Path, data: str, folder: Path, options: Sequence[str], delta
         **usage,
     }
     if DATA_SETS[data].clouds:
-        cloud, _ = run_list3r("eval", "cloud", str(source), str(memory), "--align", "trajectory")
+        cloud, _ = run_list3r("eval", "cloud", str(source), str(memory))
         row |= {"cloud": cloud}
     return row
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
+from list3r.simulation.dataset import WalkSettings, write_walk
 from tests.rgbd_scenes import walk
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -41,6 +43,29 @@ def test_the_papers_sequences_are_found_and_missing_ones_named(
     assert all(tmp_path / name == path for name, path in found)
     missing = capsys.readouterr().out.count("left out")
     assert missing == len(sequences.DATA_SETS[data].scenes) - (1 if data == "bonn" else expected)
+
+
+def test_eth3d_and_bonn_are_built_and_evaluated_from_their_layouts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ETH3D: a list of associations and a file of intrinsics; BONN: neither, its intrinsics are the benchmark's."""
+    eth3d, bonn = tmp_path / "eth3d" / "plant_scene_3", tmp_path / "bonn" / "rgbd_bonn_crowd"
+    write_walk(eth3d, WalkSettings(seed=3, frames=12, size=(640, 480), focal=542.7))
+    shutil.copytree(eth3d, bonn)
+    (bonn / "calibration.txt").unlink()
+    rows = [line.split() for line in (eth3d / "rgb.txt").read_text().splitlines() if not line.startswith("#")]
+    paired = [f"{t} {name} {t} {name.replace('rgb', 'depth')}" for t, name in rows]
+    (eth3d / "associated.txt").write_text("\n".join(paired) + "\n")
+    for data, folder in (("eth3d", eth3d), ("bonn", bonn)):
+        out = tmp_path / f"{data}.json"
+        words = ["sequences.py", data, "--root", str(folder.parent), "--json", str(out)]
+        monkeypatch.setattr(sys, "argv", words)
+        sequences.main()
+        (row,) = json.loads(out.read_text())["scenes"]
+        assert row["scene"] == folder.name and row["posed"] == row["frames"] == 12
+        assert row["ate_se3_m"] < 0.02 and row["scale"] == pytest.approx(1.0, abs=0.1)
+        assert ("cloud" in row) == (data == "eth3d")
+    assert "kidnap_1: left out" in capsys.readouterr().out
 
 
 def test_neural_rgbd_is_read_with_its_poses_and_depth(tmp_path: Path) -> None:
