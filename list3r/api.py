@@ -156,10 +156,10 @@ class SceneMemory(MemoryEdits):
         from list3r.queries.info import describe_counts
 
         try:
-            told = f"{self.path.name!r}: {describe_counts(self.store)}"
+            text = f"{self.path.name!r}: {describe_counts(self.store)}"
         except (List3rError, sqlite3.Error):
-            told = f"{self.path.name!r}, closed"
-        return f"<SceneMemory {told}>"
+            text = f"{self.path.name!r}, closed"
+        return f"<SceneMemory {text}>"
 
     def __len__(self) -> int:
         return len(self.instances())

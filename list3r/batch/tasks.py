@@ -63,11 +63,11 @@ def read_tasks(where: str, asked: Asked) -> list[list[BatchTask]]:
     if not lines:
         raise OptionError(f"{where} names no video; give a manifest with one video per line, or a folder of videos")
     groups: dict[str, list[BatchTask]] = {}
-    said: dict[str, bool] = {}
+    names_memory: dict[str, bool] = {}
     for at, fields in lines:
         named = "memory" in fields
         task = _task(at, dict(fields), asked)
-        if task.memory in groups and not (named and said[task.memory]):
+        if task.memory in groups and not (named and names_memory[task.memory]):
             raise OptionError(
                 f"{at}: a second video would go to {task.memory}.l3r; name its memory in the manifest, as in "
                 f'{{"source": "{task.source}", "memory": "{task.memory}-2"}}'
@@ -75,7 +75,7 @@ def read_tasks(where: str, asked: Asked) -> list[list[BatchTask]]:
         if any(other.source == task.source for other in groups.get(task.memory, [])):
             raise OptionError(f"{at}: {task.source} is named a second time; remove the line")
         groups.setdefault(task.memory, []).append(task)
-        said[task.memory] = named
+        names_memory[task.memory] = named
     return list(groups.values())
 
 

@@ -97,11 +97,11 @@ def open_backend(url: str, connections: int = 1, *, make: bool = True) -> Backen
 
     Without `make` a file that is not there is refused. Raises `CatalogError`.
     """
-    kind, told, rest = url.partition("://")
-    if not told or kind == "sqlite":
+    kind, separator, rest = url.partition("://")
+    if not separator or kind == "sqlite":
         from list3r.catalog.sqlite import SqliteBackend
 
-        path = rest.removeprefix("/") if told else url
+        path = rest.removeprefix("/") if separator else url
         if not make and not Path(path).exists():
             raise CatalogError(f"{path} does not exist; `list3r catalog add FILE... --catalog {path}` makes it")
         return SqliteBackend(path)

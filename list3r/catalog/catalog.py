@@ -192,8 +192,8 @@ class Catalog:
             filters = CatalogFilters(True, filters.min_confidence, filters.state)
         found, ranked = self._backend.named(memory, wanted, k, filters)
         notes = [f"{ranked} things match {text!r} or more; so many were ranked"] if ranked >= MOST_RANKED else []
-        said = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
-        return self._answers(((t, score, None, said) for t, score in found), entries, notes)
+        wording = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
+        return self._answers(((t, score, None, wording) for t, score in found), entries, notes)
 
     def similar(
         self,
@@ -312,10 +312,10 @@ class Catalog:
     ) -> CatalogAnswers:
         held = list(rows)
         by_name = self._by_name(known, (t.memory for t, *_ in held))
-        found = [_match(t, *by_name[t.memory], told) for t, *told in held if t.memory in by_name]
+        found = [_match(t, *by_name[t.memory], notices) for t, *notices in held if t.memory in by_name]
         stale = sorted({m.memory for m in found if m.stale})
-        told = [f"{n} has changed since it was added; `list3r catalog add` adds the present file" for n in stale]
-        return CatalogAnswers(found, [*notes, *told])
+        notices = [f"{n} has changed since it was added; `list3r catalog add` adds the present file" for n in stale]
+        return CatalogAnswers(found, [*notes, *notices])
 
 
 def _of(name: str, found: tuple[MemoryEntry, list[CatalogThing]] | None) -> tuple[MemoryEntry, list[CatalogThing]]:
@@ -354,8 +354,8 @@ def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> 
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
 
 
-def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, told: Sequence[Any]) -> CatalogMatch:
-    score, distance, reason = told
+def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, found: Sequence[Any]) -> CatalogMatch:
+    score, distance, reason = found
     return CatalogMatch(
         t.memory,
         entry.revision,
@@ -393,7 +393,7 @@ def _wanted(phrase: Phrase) -> Wanted:
     for clause in phrase.where:
         stored = tuple(p for p in clause.predicates if p not in VIEWPOINT)
         if not stored:
-            raise OptionError(f"{phrase.text!r}: {clause.said!r} depends on the viewpoint; ask the memory's file")
+            raise OptionError(f"{phrase.text!r}: {clause.wording!r} depends on the viewpoint; ask the memory's file")
         where.append((stored, _wanted(clause.object)))
     if not phrase.words and not where:
         raise OptionError(f"{phrase.text!r} has no word to search for; name an object, a colour or a shape")

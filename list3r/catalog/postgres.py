@@ -338,7 +338,7 @@ class PostgresBackend:
     def _failed(self, what: str, error: psycopg.Error) -> CatalogError:
         if what == _WRITTEN:
             what += "; the same again is safe" if _lost(error) else "; nothing was changed"
-        return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_said(error)}")
+        return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_first_line(error)}")
 
 
 def _lost(error: psycopg.Error) -> bool:
@@ -362,7 +362,7 @@ def _checked(url: str) -> str:
     return f"{parts.hostname or 'this machine'}{parts.path}"
 
 
-def _said(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """Return in one line what the server or the library says."""
     text = getattr(getattr(error, "diag", None), "message_primary", None) or str(error).strip() or type(error).__name__
     return str(text).splitlines()[0]
@@ -431,9 +431,9 @@ def _copy_things(connection: psycopg.Connection[Any], memory: int, content: Memo
         with cursor.copy("COPY instance FROM STDIN") as copy:
             for t in content.things:
                 bounds = ",".join(map(_corner, t.bounds()))
-                told = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
+                values = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
                 words = list(t.words), list(t.words.values())
-                copy.write_row((memory, t.id, *told, t.box_numbers(), bounds, *words))
+                copy.write_row((memory, t.id, *values, t.box_numbers(), bounds, *words))
         with cursor.copy("COPY relation FROM STDIN") as copy:
             for row in content.relations:
                 copy.write_row((memory, *row))

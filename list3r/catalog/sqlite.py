@@ -96,7 +96,7 @@ class SqliteBackend:
         first = int(database.execute("SELECT coalesce(max(number), 0) + 1 FROM instance").fetchone()[0])
         things = list(enumerate(content.things, first))
         marks = ", ".join("?" for _ in range(11))
-        rows = ((n, memory, *_told(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in things)
+        rows = ((n, memory, *_columns_of(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in things)
         database.executemany(f"INSERT INTO instance VALUES ({marks})", rows)
         boxes = ((n, *(v for pair in zip(*t.bounds(), strict=True) for v in pair), memory, memory) for n, t in things)
         database.executemany("INSERT INTO bounds VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", boxes)
@@ -323,7 +323,7 @@ class SqliteBackend:
             raise CatalogError(f"{self._path} cannot be written: {error}; nothing was changed") from error
 
 
-def _told(t: CatalogThing) -> tuple[object, ...]:
+def _columns_of(t: CatalogThing) -> tuple[object, ...]:
     return t.id, t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component
 
 
@@ -354,8 +354,8 @@ def _thing(row: Sequence[Any]) -> CatalogThing:
 def thing_of(row: Sequence[Any], box: NDArray[np.float64]) -> CatalogThing:
     """Return an instance of a row of its fields and the 15 numbers of its box."""
     memory, id, label, description, state, structure, confidence, sigma, component = row[:9]
-    told = (label, description, state, structure, confidence, sigma, component)
-    return CatalogThing(memory, id, *told, box_of(box), {})
+    values = (label, description, state, structure, confidence, sigma, component)
+    return CatalogThing(memory, id, *values, box_of(box), {})
 
 
 def box_of(numbers: NDArray[np.float64]) -> OrientedBox:

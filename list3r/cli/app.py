@@ -143,7 +143,7 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
 
 def run(arguments: list[str]) -> int:
     """Run one command; its exit status. What failed is said in one line, with `--json` in an answer as well."""
-    told = _Failures(wants_json(arguments))
+    failures = _Failures(wants_json(arguments))
     try:
         if arguments and arguments[0] in _BUILDING:
             check_address_space(BUILD_MB, f"list3r {arguments[0]}")
@@ -155,11 +155,11 @@ def run(arguments: list[str]) -> int:
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except _USAGE_ERROR as error:
-        return told.usage(error)
+        return failures.usage(error)
     except _COMMAND_ERROR as error:
-        return told.fail("OptionError", error.format_message())  # type: ignore[attr-defined]
+        return failures.fail("OptionError", error.format_message())  # type: ignore[attr-defined]
     except List3rError as error:
-        return _unwritten(error) if isinstance(error, OutputError) else told.fail(type(error).__name__, str(error))
+        return _unwritten(error) if isinstance(error, OutputError) else failures.fail(type(error).__name__, str(error))
     except (KeyboardInterrupt, typer.Abort):
         tell("", "interrupted")
         return 1
@@ -168,9 +168,9 @@ def run(arguments: list[str]) -> int:
             raise
         return _unheard()
     except (RuntimeError, OSError) as error:
-        return told.fail_of_system(error)
+        return failures.fail_of_system(error)
     except (MemoryError, ImportError) as error:
-        return told.fail_of_memory(error)
+        return failures.fail_of_memory(error)
 
 
 @dataclass(frozen=True)

@@ -250,13 +250,13 @@ class FolderSource:
 
     def _scale_doubts(self) -> tuple[str, ...]:
         """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
-        said, usual = self._options.depth_scale, self._layout.optics.depth_scale
-        if not self._has_depth or said is None or usual is None or usual == said:
+        given, usual = self._options.depth_scale, self._layout.optics.depth_scale
+        if not self._has_depth or given is None or usual is None or usual == given:
             return ()
-        times = usual / said
+        times = usual / given
         how = f"{times:.3g} times larger" if times > 1 else f"{1 / times:.3g} times smaller"
         kind = self._layout.kind
-        return (f"--depth-scale {said:g} makes all {how}: the {kind} layout has {usual:g} units a metre",)
+        return (f"--depth-scale {given:g} makes all {how}: the {kind} layout has {usual:g} units a metre",)
 
     def _camera_doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with the camera: a centre far from the middle is that of another size."""
@@ -398,11 +398,11 @@ def reduced_note(rig: Rig) -> str:
 
 def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOptions) -> str:
     """Hash of the files' names and sizes and of every option that shapes frames. 32 hexadecimal digits."""
-    said = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
+    given = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
     found = hashlib.sha256(f"({kind!r}, [".encode())  # as the text of a tuple that is never whole in memory
     for number, row in enumerate(listing):
         found.update((", " if number else "").encode() + repr(row).encode())
-    found.update(f"], {sorted(said.items())!r})".encode())
+    found.update(f"], {sorted(given.items())!r})".encode())
     return found.hexdigest()[:32]
 
 

@@ -50,7 +50,7 @@ class Optics:
     """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4)."""
     shares_view: bool = False
     """Depth is of the colour camera itself, if at another size; `depth_intrinsics` say otherwise."""
-    said: bool = False
+    by_user: bool = False
     """`intrinsics` are the user's word, not that of a file: a centre far from the middle is taken as it is."""
 
 
@@ -84,7 +84,7 @@ VARIES = 0.003
 
 
 def varies_note(spread: float, carried: bool) -> str:
-    """Return what is said of frames whose focal lengths differ by a share."""
+    """Return what is by_user of frames whose focal lengths differ by a share."""
     what = "every frame is carried to one camera" if carried else "one camera serves all of them"
     return f"focal lengths of frames differ by {100 * spread:.1f} %: {what}"
 

@@ -70,12 +70,12 @@ def select(
 
 def _range_text(options: SourceOptions) -> str:
     """Return the options that say from where to where, in the user's words."""
-    said = []
+    parts = []
     if options.start is not None or options.stop is not None:
-        said.append(f"frames {'' if options.start is None else options.start}:{options.stop or ''}")
+        parts.append(f"frames {'' if options.start is None else options.start}:{options.stop or ''}")
     if options.start_s is not None or options.end_s is not None:
-        said.append(f"seconds {options.start_s or 0:g} to {'the end' if options.end_s is None else options.end_s}")
-    return " and ".join(said) or "the options"
+        parts.append(f"seconds {options.start_s or 0:g} to {'the end' if options.end_s is None else options.end_s}")
+    return " and ".join(parts) or "the options"
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:

@@ -130,8 +130,8 @@ def require_camera(info: SourceInfo) -> Camera:
 def check_bad_share(bad: int, total: int, reason: str = "") -> None:
     """Raises `SourceError` when more than half of the frames could not be used, with the `reason` of one of them."""
     if bad * 2 > total:
-        said = f" ({reason})" if reason else ""
-        raise SourceError(f"{bad} of {total} frames cannot be used{said}; is the copy of the source complete?")
+        why = f" ({reason})" if reason else ""
+        raise SourceError(f"{bad} of {total} frames cannot be used{why}; is the copy of the source complete?")
 
 
 def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
@@ -168,8 +168,8 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     inside = next((p for p in folders if images.find(p, options)), None)
     if inside is not None and options.kind in ("auto", "images"):
         raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
-    said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
-    raise SourceError(f"{root} has {said}; {_WANTED}")
+    problem = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
+    raise SourceError(f"{root} has {problem}; {_WANTED}")
 
 
 def _check_nothing_ignored(root: Path, kind: str, options: SourceOptions) -> None:

@@ -34,12 +34,12 @@ def imported_as(store: Store, instance_id: int) -> dict[str, Any] | None:
 
     None for an instance that was built.
     """
-    told = store.facts[IMPORTED]
-    if told is None:
+    stored = store.facts[IMPORTED]
+    if stored is None:
         return None
     first = min(chunk.chunk_id for chunk in store.chunks.all())  # the map itself; later ones are of videos
-    names = [told["names"][o.local_id] for o in store.observations.of(instance_id) if o.chunk_id == first]
-    return {"format": told["format"], "path": told["path"], "names": names} if names else None
+    names = [stored["names"][o.local_id] for o in store.observations.of(instance_id) if o.chunk_id == first]
+    return {"format": stored["format"], "path": stored["path"], "names": names} if names else None
 
 
 @dataclass(frozen=True)

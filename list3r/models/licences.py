@@ -73,11 +73,11 @@ def terms(card: ModelCard, weights: Weights | None) -> str:
     """Return what a user should know before using a model commercially; empty where there is nothing to say."""
     if weights is None:
         return ""
-    said = [
+    conditions = [
         f"{what} {licence.name}"
         for what, licence in (("code", card.code), ("weights", weights.licence))
         if licence.kind != "permissive"
     ]
     if weights.gated:
-        said.append("gated")
-    return f"{card.name}: {', '.join(said)}" if said else ""
+        conditions.append("gated")
+    return f"{card.name}: {', '.join(conditions)}" if conditions else ""

@@ -88,9 +88,9 @@ def relations(
 def relations_of(store: Store, instance_id: int) -> list[Relation]:
     """Return the stored relations of an instance, each once: of two inverse ones that in which it is the subject."""
     own = store.relations.all(instance_id, None, None)
-    told = {(r.predicate, r.object) for r in own}
+    stored = {(r.predicate, r.object) for r in own}
     others = store.relations.all(None, None, instance_id)
-    return [*own, *(r for r in others if (INVERSE.get(r.predicate), r.subject) not in told)]
+    return [*own, *(r for r in others if (INVERSE.get(r.predicate), r.subject) not in stored)]
 
 
 def viewer_from(store: Store, viewpoint: Place) -> Viewpoint | None:

@@ -89,12 +89,12 @@ def make_server(served: SceneMemory | Catalog, *, http: HttpSettings | None = No
         **guard,
     )
     for tool in _public_methods(CatalogTools(served) if isinstance(served, Catalog) else ReadingTools(served)):
-        server.tool(annotations=ToolAnnotations(read_only_hint=True, open_world_hint=False))(_told(tool))
+        server.tool(annotations=ToolAnnotations(read_only_hint=True, open_world_hint=False))(_with_errors(tool))
     if isinstance(served, Catalog):
         return server
     if served.writable:
         for tool in _public_methods(WritingTools(served)):
-            server.tool(annotations=ToolAnnotations(read_only_hint=False, open_world_hint=False))(_told(tool))
+            server.tool(annotations=ToolAnnotations(read_only_hint=False, open_world_hint=False))(_with_errors(tool))
     _add_resources(server, served)
     _add_prompts(server)
     return server
@@ -152,17 +152,17 @@ def _public_methods(tools: object) -> Iterator[Callable[..., Any]]:
             yield getattr(tools, name)
 
 
-def _told(tool: Callable[..., Any]) -> Callable[..., Any]:
+def _with_errors(tool: Callable[..., Any]) -> Callable[..., Any]:
     """Return the same tool; errors that the user can mend reach the agent as one line."""
 
     @functools.wraps(tool)
-    def asked(*args: Any, **words: Any) -> Any:
+    def call(*args: Any, **kwargs: Any) -> Any:
         try:
-            return tool(*args, **words)
+            return tool(*args, **kwargs)
         except List3rError as error:
             raise ToolError(str(error)) from error
 
-    return asked
+    return call
 
 
 def _add_resources(server: MCPServer[Any], memory: SceneMemory) -> None:

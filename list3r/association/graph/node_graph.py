@@ -24,7 +24,8 @@ from list3r.association.graph.chunk_nodes import (
     measured_walk,
     walk_covariance,
 )
-from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of
+from list3r.association.graph.edge_information import information_of
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings
 from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.solver import GraphProblem, stack, take, unstack
 from list3r.memory.bends import Bend
@@ -144,7 +145,7 @@ def _problem(
     if rest:
         factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
         factors[[not e.accepted for e in rest]] *= _NOTHING
-        stiff = replace(weights, weights=replace(weights.weights, bend=0.0))  # the nodes bend instead
+        stiff = replace(weights.weights, bend=0.0)  # the nodes bend instead
         information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
     fixed = np.zeros(pieces.count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True

@@ -64,8 +64,8 @@ def place_by_surfaces(
     ties: list[tuple[Edge, Sim3, Array]] = []
     for edge in believed:
         u, v = pieces.nodes[edge.u], pieces.nodes[edge.v]
-        told = relations.get((edge.u, edge.v)) if edge.kind == "adjacent" else None
-        mean = [] if told is None else ties_of(told, edge, u, v, NodeSettings())
+        relation = relations.get((edge.u, edge.v)) if edge.kind == "adjacent" else None
+        mean = [] if relation is None else ties_of(relation, edge, u, v, NodeSettings())
         if mean:
             ties.append((edge, mean[0].S_v_u, mean[0].covariance + _bending(u, s)))
         elif edge.covariance is not None:

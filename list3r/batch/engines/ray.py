@@ -43,8 +43,8 @@ class RayEngine:
             try:
                 outcome = self._cluster.result(done)
             except self._cluster.errors.RayError as error:
-                said = next((line for line in str(error).splitlines() if line.strip()), "")
-                outcome = Outcome(job.task, "lost", f"{type(error).__name__}: {said}".rstrip(": "))
+                reason = next((line for line in str(error).splitlines() if line.strip()), "")
+                outcome = Outcome(job.task, "lost", f"{type(error).__name__}: {reason}".rstrip(": "))
             yield outcome
 
     def cancel(self) -> None:

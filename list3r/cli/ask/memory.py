@@ -141,8 +141,8 @@ def show(
         origin = imported_as(scene.store, instance.id)
     if json:
         related = [vars(r) for r in relations]
-        told = {"relations": related, "aliases": aliases, "observed_as": parts, "imported_as": origin}
-        print_answer([{**instance_dict(instance, track), **label_source(instance, named), **told}], units)
+        extra = {"relations": related, "aliases": aliases, "observed_as": parts, "imported_as": origin}
+        print_answer([{**instance_dict(instance, track), **label_source(instance, named), **extra}], units)
         return
     say(f"{instance.id}  {instance.label or instance.description}")
     count = len({part["chunk"] for part in parts})

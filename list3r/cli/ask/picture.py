@@ -38,7 +38,7 @@ def picture(
     with replacing(out) as temporary:
         Image.fromarray(found.marked() if whole else found.crop()).save(temporary, quality=92)
     if json:
-        told = {"id": found.instance_id, "session": found.session_id, "frame": found.frame_index}
-        print_answer([{**told, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)}])
+        fields = {"id": found.instance_id, "session": found.session_id, "frame": found.frame_index}
+        print_answer([{**fields, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)}])
     else:
         say(f"{out}  frame {found.frame_index} of session {found.session_id}, {found.visible_fraction:.0%} visible")

@@ -38,8 +38,8 @@ def watching(
                 begun = begun or done > 0
                 bar.show(done, total)
 
-            told = (lambda line: note(f"note: {line}")) if notes and not quiet else None
-            yield Watch(progress, looking(bar, title), told, debug)
+            on_note = (lambda line: note(f"note: {line}")) if notes and not quiet else None
+            yield Watch(progress, looking(bar, title), on_note, debug)
     except KeyboardInterrupt:
         note("", interrupted(begun))
         raise typer.Exit(1) from None
@@ -74,12 +74,12 @@ def say_result(
     except FinishingError as error:
         report, failure = cast(Report, error.report), error
     if json:
-        told = {"memory": str(memory), **report.as_dict()}
-        del told["notes"]
+        result = {"memory": str(memory), **report.as_dict()}
+        del result["notes"]
         failed: dict[str, Any] = {}
         if failure is not None:
             failed["error"] = {"kind": type(failure).__name__, "message": str(failure), "status": 2}
-        print_answer([told], notes=report.notes, **failed)
+        print_answer([result], notes=report.notes, **failed)
     else:
         say(*lines(memory, report))
     if failure is not None and json:

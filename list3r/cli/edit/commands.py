@@ -151,10 +151,10 @@ def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool
         print_answer([report.as_dict()], units)
         return
     say(f"{report.text} (entry {report.entry})")
-    told = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]
-    told += [f"#{old} resolves to #{new}" for old, new in report.aliases]
-    if told:
-        say("; ".join(told))
+    lines = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]
+    lines += [f"#{old} resolves to #{new}" for old, new in report.aliases]
+    if lines:
+        say("; ".join(lines))
 
 
 def _parse_parts(text: str) -> list[tuple[int, int]]:

@@ -41,8 +41,8 @@ def scale(
         kind, source = (scene.store.facts.scale_kind or "relative"), scene.store.facts.scale_source
         units = scene.units
     if json:
-        told = None if anchor is None else report.as_dict()
-        print_answer([{"scale": kind, "scale_source": source, "edit": told}], units)
+        result = None if anchor is None else report.as_dict()
+        print_answer([{"scale": kind, "scale_source": source, "edit": result}], units)
     elif kind == "relative":
         say('scale relative: how long a unit is is unknown; --anchor "ID=0.095m" turns units into metres')
     else:

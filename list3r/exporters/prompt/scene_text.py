@@ -217,15 +217,15 @@ class _SceneWriter:
 
     def gaps(self, budget: Budget, listed: Sequence[Instance]) -> None:
         """Add the nearest things of each listed thing with the gap between their surfaces."""
-        items, told, cost = [], set[frozenset[int]](), 0
+        items, written, cost = [], set[frozenset[int]](), 0
         for i in listed:
             if i.structure is not None or cost > budget.left:
                 continue
             near = []
             for m in self.memory.nearest(i.id, k=self.settings.neighbours):
                 pair = frozenset((i.id, m.instance.id))
-                if m.distance_m is not None and pair not in told:
-                    told.add(pair)
+                if m.distance_m is not None and pair not in written:
+                    written.add(pair)
                     near.append(f"{m.instance.id} {self.number(m.distance_m)}")
             if near:
                 items.append(f"{i.id}: {', '.join(near)}")
@@ -237,11 +237,11 @@ class _SceneWriter:
         """Add further relations between listed things, the surest first."""
         shown = {i.id for i in listed}
         for predicate in _TOLD:
-            told, items = set[frozenset[int]](), []
+            written, items = set[frozenset[int]](), []
             for r in self.stored:
                 pair = frozenset((r.subject, r.object))
-                if r.predicate == predicate and {r.subject, r.object} <= shown and pair not in told:
-                    told.add(pair)
+                if r.predicate == predicate and {r.subject, r.object} <= shown and pair not in written:
+                    written.add(pair)
                     items.append(f"{r.subject} {r.object}")
             if items:
                 budget.add_list(f"{predicate.replace('_', ' ')}:".capitalize(), items)

@@ -66,7 +66,7 @@ class Record3dPhone:
             raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
         self._serial, self._tell = serial, tell
         self._first: _PhoneFrame | None = None
-        self._told = set[str]()
+        self._noted = set[str]()
 
     def pictures(self, folder: Path, silence_s: float) -> Iterator[LivePicture]:
         """The frames of one connection; the camera is written to `folder` with the first of all.
@@ -80,19 +80,19 @@ class Record3dPhone:
                 frame = _parsed(_message(phone))
                 first = self._first = self._first or _begun(folder, frame)
                 if frame.sizes != first.sizes:
-                    self._say(f"pictures that are not {first.sizes.color[0]}x{first.sizes.color[1]} are left out")
+                    self._note_once(f"pictures that are not {first.sizes.color[0]}x{first.sizes.color[1]} are left out")
                     continue
                 if again:
-                    self._say("the phone's poses after a lost connection are of another world and are left out")
+                    self._note_once("the phone's poses after a lost connection are of another world and are left out")
                 if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > _VARIES:
-                    self._say("the focal length changes by more than 1 %: one camera serves all pictures")
+                    self._note_once("the focal length changes by more than 1 %: one camera serves all pictures")
                 pose = () if again else frame.pose
                 yield LivePicture(frame.files.copy, " ".join(f"{v:.9g}" for v in pose))
 
-    def _say(self, line: str) -> None:
+    def _note_once(self, line: str) -> None:
         """Tell something, once."""
-        if line not in self._told:
-            self._told.add(line)
+        if line not in self._noted:
+            self._noted.add(line)
             self._tell(line)
 
 
@@ -100,9 +100,9 @@ def _begun(folder: Path, frame: _PhoneFrame) -> _PhoneFrame:
     """Write down the camera of the first frame, as Record3D's own recordings state theirs."""
     (width, height), depth = frame.sizes.color, frame.sizes.depth
     fx, fy, cx, cy = frame.intrinsics
-    said = {"w": width, "h": height, "dw": depth[0], "dh": depth[1], "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
-    said["confidence"] = ".conf" in frame.files
-    (folder / METADATA).write_text(json.dumps(said), encoding="ascii")
+    metadata = {"w": width, "h": height, "dw": depth[0], "dh": depth[1], "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    metadata["confidence"] = ".conf" in frame.files
+    (folder / METADATA).write_text(json.dumps(metadata), encoding="ascii")
     return frame
 
 

@@ -84,8 +84,8 @@ def _daemon(timeout_s: float) -> socket.socket:
         host, _, port = address.rpartition(":")
         return socket.create_connection((host, int(port)), timeout_s)
     except (OSError, ValueError, OverflowError) as error:
-        said = getattr(error, "strerror", None) or error
-        raise LostError(f"usbmuxd does not answer at {address} ({said}): is it installed and running?") from None
+        reason = getattr(error, "strerror", None) or error
+        raise LostError(f"usbmuxd does not answer at {address} ({reason}): is it installed and running?") from None
 
 
 def _ask(daemon: socket.socket, kind: str, **words: object) -> dict[str, Any]:

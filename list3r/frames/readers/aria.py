@@ -83,7 +83,7 @@ class AriaSource:
         limit = WORKING_SIDES[self._depth_path is not None] if options.max_side is None else options.max_side
         self._view = UprightView(lens, (int(size[0]), int(size[1])), turns, limit)
         self._poses = [None if T is None else T @ self._view.T_cam_upright for T in placed] or [None] * len(pairs)
-        notes += [] if table is None or moved is None else _said(table, moved, self._poses)
+        notes += [] if table is None or moved is None else _pose_notes(table, moved, self._poses)
         self._info = self._describe(root, tuple(notes), moved)
 
     @property
@@ -147,18 +147,18 @@ class AriaSource:
 
 
 def _check(root: Path, options: SourceOptions) -> None:
-    said = {
+    reasons = {
         "--intrinsics": options.intrinsics,
         "--distortion": options.distortion,
         "--depth-intrinsics": options.depth_intrinsics,
         "--depth-to-color": options.T_color_depth,
     }
-    given = [name for name, value in said.items() if value is not None]
+    given = [name for name, value in reasons.items() if value is not None]
     if given:
         raise OptionError(f"{root} states its own cameras; leave out {' and '.join(given)}")
 
 
-def _said(table: Path, moved: DeviceTrajectory, poses: Sequence[NDArray[np.float64] | None]) -> list[str]:
+def _pose_notes(table: Path, moved: DeviceTrajectory, poses: Sequence[NDArray[np.float64] | None]) -> list[str]:
     out = [f"poses of {table.name} for {sum(T is not None for T in poses)} of {len(poses)} pictures"]
     if moved.elsewhere:
         out.append(f"{moved.elsewhere} pictures have poses in another world (graph_uid), which are left out")

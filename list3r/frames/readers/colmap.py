@@ -94,10 +94,10 @@ def _read(model: Path) -> tuple[Any, dict[str, NDArray[np.float64]]]:
     except IndexError:
         raise SourceError(apart) from None
     except (RuntimeError, ValueError, OSError) as error:
-        said = str(error).splitlines()[0]
-        if "optional" in said:
-            said = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
-        raise SourceError(f"{model} is not a model of COLMAP that can be read ({said})") from None
+        reason = str(error).splitlines()[0]
+        if "optional" in reason:
+            reason = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
+        raise SourceError(f"{model} is not a model of COLMAP that can be read ({reason})") from None
     poses = {name: pose_matrix(rows.ravel().tolist()) for name, rows in stated.items()}
     wrong = [name for name, T in poses.items() if T is None]
     if wrong:

@@ -57,11 +57,11 @@ class LeRobotSource:
             code = DepthCode.of(filmed[depth].get("info"))
             self._depth = _DepthVideo(file, round(begins_s * fps), episode.length, code)
         stored = self._video.stored_size
-        optics, said = merge_optics(FolderLayout("lerobot", FrameFiles(), Optics(depth_scale=1.0)), options)
+        optics, merged_notes = merge_optics(FolderLayout("lerobot", FrameFiles(), Optics(depth_scale=1.0)), options)
         size = None if self._depth is None else self._depth.size
         self._rig = build_rig(optics, stored, size, options.max_depth_m, _side(options, depth is not None))
         used = {color} if depth is None else {color, depth}
-        notes = [f"episode {episode.number}, {episode.length} frames, of the camera {color}", *said]
+        notes = [f"episode {episode.number}, {episode.length} frames, of the camera {color}", *merged_notes]
         if depth is not None and self._rig.registration is None:
             notes.append(f"depth of {depth} is taken to lie on the colour pixels; --depth-to-color says otherwise")
         if unused := [k for k in features if k not in used and k not in _BOOKKEEPING]:
@@ -153,8 +153,8 @@ def _choose(root: Path, role: str, keys: Mapping[str, Any], options: SourceOptio
     if wanted is None and len(keys) == 1:
         return next(iter(keys))
     if wanted is None or wanted not in keys:
-        said = "has several cameras" if wanted is None else f"has no camera {wanted}"
-        raise OptionError(f"{root} {said} ({names}); choose by --topics {role}=KEY")
+        problem = "has several cameras" if wanted is None else f"has no camera {wanted}"
+        raise OptionError(f"{root} {problem} ({names}); choose by --topics {role}=KEY")
     return wanted
 
 

@@ -39,7 +39,7 @@ _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TF = "tf2_msgs/msg/TFMessage"
 _INFO = "sensor_msgs/msg/CameraInfo"
-_TOLD_EVERY = 200
+_REPORTED_EVERY = 200
 """Messages after which whoever watches hears of the listing."""
 _PACKED = ".zstd"
 """Ends the names of files that `ros2 bag record --compression-mode file` packed, also in metadata, which stay so."""
@@ -116,12 +116,12 @@ class BagSource:
         world = tree.world_of(color.frame)
         self._poses = tree.poses(color.frame, world, self._times_s) if world else [None] * len(pairs)
         self._chosen = select(self._times_s, options, path, clock=True, video=False)
-        merged, said = merge_optics(FolderLayout("rosbag", FrameFiles(), optics), options)
+        merged, merged_notes = merge_optics(FolderLayout("rosbag", FrameFiles(), optics), options)
         size = None if depth is None else read_depth(depth.first).shape
         stored = read_color(color.first).shape[:2]
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
         posed = sum(T is not None for T in self._poses)
-        notes = [*notes, *said, *_cut_off(path), *unread]
+        notes = [*notes, *merged_notes, *_cut_off(path), *unread]
         if len(pairs) < len(color.times_s):
             left = len(color.times_s) - len(pairs)
             notes.append(f"{left} of {len(color.times_s)} pictures have no depth within 20 ms and are left out")
@@ -247,8 +247,10 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         with AnyReader(_parts(path), default_typestore=known) as reader:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SourceError(f"{path} cannot be read as a ROS recording ({said}); reindex it, or copy it again") from None
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SourceError(
+            f"{path} cannot be read as a ROS recording ({reason}); reindex it, or copy it again"
+        ) from None
 
 
 def _parts(path: Path) -> list[Any]:
@@ -346,13 +348,13 @@ class _Topics:
 
     def unread(self, pictures: set[str]) -> tuple[str, ...]:
         """Return a note on the topics that nothing is taken from, where `pictures` are those of colour and depth."""
-        left = [t for t in self._of if t not in pictures and not self._told(t)]
+        left = [t for t in self._of if t not in pictures and not self._taken_in(t)]
         return (f"not read: {self._named(left)}",) if left else ()
 
-    def _told(self, topic: str) -> bool:
-        """Whether what a topic says of cameras and poses was taken in."""
+    def _taken_in(self, topic: str) -> bool:
+        """Whether the cameras or poses of a topic were used."""
         kind = self._of[topic].msgtype
-        return kind not in _IMAGES and self._tells(topic, kind, self._pose_topic)
+        return kind not in _IMAGES and self._is_read(topic, kind, self._pose_topic)
 
     def _all_topics(self) -> str:
         return f"it has {self._named(list(self._of))}" if self._of else "it is empty"
@@ -370,11 +372,11 @@ class _Topics:
         units: dict[str, float] = {}
         tree = TransformTree()
         pose_topic = self._pose_topic
-        looked_at = [c for c in self._reader.connections if self._tells(c.topic, c.msgtype, pose_topic)]
+        looked_at = [c for c in self._reader.connections if self._is_read(c.topic, c.msgtype, pose_topic)]
         count = sum(c.msgcount for c in looked_at)
         for number, (connection, received, raw) in enumerate(self._reader.messages(looked_at), start=1):
             topic, kind = connection.topic, connection.msgtype
-            if self._listing is not None and (number % _TOLD_EVERY == 0 or number == count):
+            if self._listing is not None and (number % _REPORTED_EVERY == 0 or number == count):
                 self._listing(number, count)
             if kind in _IMAGES:
                 if topic not in first:
@@ -403,8 +405,8 @@ class _Topics:
         return streams, tree, infos, by_topic
 
     @staticmethod
-    def _tells(topic: str, kind: str, pose_topic: str | None) -> bool:
-        """Whether messages say something of pictures, cameras or poses; clouds and the like are not read."""
+    def _is_read(topic: str, kind: str, pose_topic: str | None) -> bool:
+        """Whether messages hold pictures, cameras or poses; clouds and the like are not read."""
         return kind in (*_IMAGES, _INFO, _TF) or topic == pose_topic or topic.endswith("/option/Depth_Units/value")
 
     def _only_pose_topic(self) -> str | None:

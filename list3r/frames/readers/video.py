@@ -30,14 +30,14 @@ _EARLIER = 4
 class VideoSource:
     """A `FrameSource` over one video stream. Every `read` opens the file anew and seeks to its first frame."""
 
-    def __init__(self, path: Path, options: SourceOptions, *, said: bool = True) -> None:
+    def __init__(self, path: Path, options: SourceOptions, *, by_user: bool = True) -> None:
         """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`.
 
-        `said`: the intrinsics of the options are the user's word, not that of a file beside the video.
+        `by_user`: the intrinsics of the options are the user's word, not that of a file beside the video.
         """
         if options.depth_intrinsics or options.T_color_depth:
             raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
-        self._path, self._options, self._said = path, options, said
+        self._path, self._options, self._by_user = path, options, by_user
         self._stamps = list_stamps(path)
         self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
         count = len(self._stamps)
@@ -162,7 +162,7 @@ class VideoSource:
         return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
 
     def _first(self) -> tuple[Upright, Rig]:
-        optics = Optics(self._options.intrinsics, self._options.distortion or (), said=self._said)
+        optics = Optics(self._options.intrinsics, self._options.distortion or (), by_user=self._by_user)
         for _, image in self._decode(int(self._chosen.starts[0])):
             turned = Upright.of(image, self._stamps.aspect)
             return turned, build_rig(optics, turned.size, None, None, self._options.max_side)

@@ -55,12 +55,14 @@ class VideoWithDepth:
         """Raises `SourceError` and `OptionError` where the files do not fit together."""
         side = WORKING_SIDES[True] if options.max_side is None else options.max_side
         words = replace(options, kind="auto", intrinsics=parts.intrinsics, max_side=side, depth_scale=None)
-        said = options.intrinsics is not None
-        self._video, self._parts = VideoSource(parts.video, words, said=said), parts
+        given = options.intrinsics is not None
+        self._video, self._parts = VideoSource(parts.video, words, by_user=given), parts
         stored = self._video.stored_size
         scale = options.depth_scale or parts.units_per_m
         lens = options.distortion or ()
-        optics = Optics(parts.intrinsics, lens, depth_scale=scale, intrinsics_size=stored, shares_view=True, said=said)
+        optics = Optics(
+            parts.intrinsics, lens, depth_scale=scale, intrinsics_size=stored, shares_view=True, by_user=given
+        )
         size = read_raw_depth(next(iter(parts.depth.values()))).shape if parts.depth else None
         self._rig = build_rig(optics, stored, (size[0], size[1]) if size else None, options.max_depth_m, side)
         self._info = self._describe(root)

@@ -31,16 +31,16 @@ class Episode:
 
 def read_features(path: Path) -> tuple[dict[str, dict[str, Any]], float]:
     """Return the features and the frames per second. Raises `SourceError`, also for a data set of another version."""
-    said = read_json(path)
-    version = said.get("codebase_version") if isinstance(said, dict) else None
-    if not isinstance(said, dict) or not isinstance(version, str):
+    info = read_json(path)
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not isinstance(info, dict) or not isinstance(version, str):
         raise SourceError(f"{path} states no codebase_version; is it of LeRobot?")
     if not version.startswith("v3."):
         raise SourceError(
             f"{path} is of LeRobot {version}, which keeps a video for each episode; give that video, or convert the "
             "data set to v3.0 by lerobot's own script"
         )
-    fps, features, video_path = said.get("fps"), said.get("features"), said.get("video_path", _VIDEO_PATH)
+    fps, features, video_path = info.get("fps"), info.get("features"), info.get("video_path", _VIDEO_PATH)
     if not isinstance(fps, int | float) or not 0 < fps < 10_000 or not isinstance(features, dict):
         raise SourceError(f"{path} states no fps or no features; was it copied whole?")
     if video_path != _VIDEO_PATH:
@@ -92,8 +92,8 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
                 _check_count(path, file.metadata.num_rows + len(found))
                 rows = file.read(columns=columns, use_threads=False).to_pylist()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            said = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise SourceError(f"{path} is not a table that can be read ({said[:160]}); copy it again") from None
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise SourceError(f"{path} is not a table that can be read ({reason[:160]}); copy it again") from None
         found |= {int(row["episode_index"]): row for row in (_sound(path, row, columns) for row in rows)}
     if not found:
         raise SourceError(f"{root} has no episodes in meta/episodes; was the copy finished?")

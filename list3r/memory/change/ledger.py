@@ -116,9 +116,9 @@ def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> M
 
 def read_ledger(store: Store, chunks: Sequence[ChunkRow]) -> ChangeLedger | None:
     """Return what stands of changes; None where several sessions have ended and nothing is written down of them."""
-    told = store.facts[_LEDGER]
-    if told is not None:
-        return told
+    stored = store.facts[_LEDGER]
+    if stored is not None:
+        return stored
     complete = {s.session_id for s in store.sessions.all() if s.state == "complete"}
     ended = sorted({c.session_id for c in chunks} & complete)
     return ChangeLedger(ended[0] if ended else 0) if len(ended) < 2 else None

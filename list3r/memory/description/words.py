@@ -36,15 +36,15 @@ def vocabulary(label: str | None, structure: str | None, description: str, color
     Of the description only what stands before the first comma counts.
     """
     out: dict[str, float] = {}
-    told = split_words(description.split(",")[0])
+    kind = split_words(description.split(",")[0])
     color = split_words(color_name)
-    for score, words in ((1.0, split_words(label or "")), (0.9, split_words(structure or "")), (0.8, told)):
+    for score, words in ((1.0, split_words(label or "")), (0.9, split_words(structure or "")), (0.8, kind)):
         for word in words:
             out[word] = max(out.get(word, 0.0), score)
     for word in color:
         out[word] = 1.0 if len(color) == 1 else 0.9
     if label is None:
-        for word in told[-1:]:
+        for word in kind[-1:]:
             out[word] = max(out[word], 0.9)
     return out
 

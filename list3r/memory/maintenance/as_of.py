@@ -83,9 +83,9 @@ def _found_anew(past: Store, then: Sequence[Instance], changed: set[int], vertic
         near = [i for i in here if any(_gap(i.aabb, m.aabb) <= _REACH_M for m in moved)]
         middle = np.mean([i.center for i in here], axis=0) if here else np.zeros(3)
         instances = [b for i in near if (b := _body(past, i, middle)) is not None]
-        told = settings_of(past, None).relations
+        settings = settings_of(past, None).relations
         upright = vertical and component == first
-        found = predicates.relations(instances, gravity_known=upright, settings=told) if moved else []
+        found = predicates.relations(instances, gravity_known=upright, settings=settings) if moved else []
         out += [r for r in found if r.subject in changed or r.object in changed]
     return out
 

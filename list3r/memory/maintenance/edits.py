@@ -85,8 +85,8 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
         leaving = _checked_part(known, keys, out) if out is not None else propose_split(store, keys)
         staying = tuple(k for k in keys if k not in set(leaving))
         edit = _edit("split", (staying, tuple(sorted(leaving))), before, author)
-        told = ", ".join(map(key_name, edit.parts[1]))
-        return _carry_out(store, edit, (f"#{known}", told), f"{edit.author} split #{known}: {told} left it")
+        names = ", ".join(map(key_name, edit.parts[1]))
+        return _carry_out(store, edit, (f"#{known}", names), f"{edit.author} split #{known}: {names} left it")
 
 
 def label(store: Store, instance_id: int, text: str | None, author: str | None = None) -> EditReport:
@@ -116,14 +116,14 @@ def scale(store: Store, anchor: str, author: str | None = None) -> EditReport:
 
     The last anchor that stands counts. Raises `OptionError` where it cannot be measured or the memory is metric.
     """
-    said = parse_anchor(_line(anchor, "anchor"))
+    parsed = parse_anchor(_line(anchor, "anchor"))
     with store.transaction():
-        found = measure(store, said)
-        what = f"#{store.ids.resolve(said.instance_id)}" if said.kind in ("size", "height") else said.kind
+        found = measure(store, parsed)
+        what = f"#{store.ids.resolve(parsed.instance_id)}" if parsed.kind in ("size", "height") else parsed.kind
         edit = _edit("scale", (found.keys,) if found.keys else (), (), author)
-        edit = replace(edit, text=said.text, scale=(found.chunk_id, found.metres_per_unit))
-        reason = f"{edit.author} anchored the scale: {said.text} where it was {found.length:.4g} units"
-        return _carry_out(store, edit, (what, said.text), reason)
+        edit = replace(edit, text=parsed.text, scale=(found.chunk_id, found.metres_per_unit))
+        reason = f"{edit.author} anchored the scale: {parsed.text} where it was {found.length:.4g} units"
+        return _carry_out(store, edit, (what, parsed.text), reason)
 
 
 def undo(store: Store, entry: int | None = None, author: str | None = None) -> EditReport:

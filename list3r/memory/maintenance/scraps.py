@@ -74,8 +74,8 @@ class _Placed:
     def _shapes_of(self, k: int) -> ChunkShapes:
         chunk, unit = self._store.chunks.get(k), self._summaries[k].unit
         nodes = self._store.local_instances.nodes([k], scraps=True)
-        told = self._settings.shapes
-        return chunk_shapes(nodes, chunk.image_size, unit, told, chunk_id=k, session_id=chunk.session_id)
+        settings = self._settings.shapes
+        return chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=k, session_id=chunk.session_id)
 
     def _same(self, a: ChunkShapes, b: ChunkShapes) -> NDArray[np.int64]:
         """Return positions (i, j) of what of two chunks lies on each other. Shape (M, 2)."""

@@ -66,7 +66,7 @@ def related(
         out = _standing(search, found, objects, clause.predicates)
     if not out and objects and (others or not clause.other):
         what = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
-        search.notes.append(f"of {len(found)} instances that match {text!r} none is known to be {clause.said} {what!r}")
+        search.notes.append(f"{len(found)} instances match {text!r}, but none is known to be {clause.wording} {what!r}")
     return out
 
 
@@ -76,7 +76,7 @@ def _few(search: PhraseSearch, objects: list[PhraseMatch], clause: Clause) -> li
     if stored or len(objects) <= _MOST_OBJECTS:
         return objects
     search.notes.append(
-        f"{len(objects)} instances match the phrase after {clause.said!r}; the best {_MOST_OBJECTS} were considered"
+        f"{len(objects)} instances match the phrase after {clause.wording!r}; the best {_MOST_OBJECTS} were considered"
     )
     return sorted(objects, key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))[:_MOST_OBJECTS]
 

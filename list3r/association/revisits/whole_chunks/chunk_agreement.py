@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class WitnessSettings:
+class ChunkAgreementSettings:
     """When the whole of two chunks speaks for a relation."""
 
     points: int = 400
@@ -49,7 +49,7 @@ class WitnessSettings:
 
 
 @dataclass(frozen=True)
-class Witness:
+class ChunkAgreement:
     """What the whole of two chunks says of a relation."""
 
     seen: float
@@ -62,7 +62,7 @@ class Witness:
 class ChunkKeyframes:
     """The keyframes of a chunk with depth, as views and as points of the chunk."""
 
-    def __init__(self, keyframes: Sequence[Keyframe], settings: WitnessSettings) -> None:
+    def __init__(self, keyframes: Sequence[Keyframe], settings: ChunkAgreementSettings) -> None:
         self._settings = settings
         self.prior = settings.prior
         self._views = {k.frame_index: (working_view(k), k.T_chunk_cam) for k in keyframes}
@@ -109,7 +109,7 @@ class ChunkKeyframes:
         return on, judged
 
 
-def witness(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[int, int]) -> Witness:
+def chunk_agreement(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[int, int]) -> ChunkAgreement:
     """Return what two chunks say of a relation (4, 4) of two keyframes (Frame.index of u and of v), metres."""
     T_u_v = np.linalg.inv(T_v_u)
     shares = []
@@ -118,7 +118,7 @@ def witness(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[in
         points, normals = source.points[rest], source.normals[rest]
         seen, met = target.fare(points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T)
         shares.append((float(seen.sum()) / max(len(source.points), 1), _least_share(normals, seen, met, u.prior)))
-    return Witness(seen=min(s for s, _ in shares), agreement=min(a for _, a in shares))
+    return ChunkAgreement(seen=min(s for s, _ in shares), agreement=min(a for _, a in shares))
 
 
 def _least_share(normals: Array, seen: Mask, met: Mask, prior: float) -> float:
