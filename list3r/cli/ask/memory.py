@@ -59,7 +59,7 @@ def list_instances(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
         ),
     ] = None,
     at: Annotated[
@@ -121,7 +121,7 @@ def show(
     ],
     json: JsonOption = False,
 ) -> None:
-    """Show one instance: where it is, how big, when it was seen, and its most telling relation to each other one.
+    """Show one instance: where it is, how big, when it was seen, and its main relation to each other instance.
 
     Example: list3r show house.l3r 12
     """

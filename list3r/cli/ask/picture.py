@@ -21,7 +21,7 @@ def picture(
     whole: Annotated[bool, typer.Option("--whole", help="The whole frame with its outline instead of a crop.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Write the stored picture that shows an instance best: most of it, unhidden, and large.
+    """Write the stored picture that shows an instance best: large, complete and not hidden.
 
     Example: list3r picture house.l3r 12 --out mug.jpg
     """

@@ -87,7 +87,7 @@ def batch(
     run: Annotated[RunOptions, _RUN],
     json: JsonOption = False,
 ) -> None:
-    """Build the memories of many videos, one task per video. Run again, it does only what is not done yet.
+    """Build the memories of many videos, one task per video. Running it again does only what is not done yet.
 
     Example: list3r batch walks/ --out memories/
     """

@@ -78,7 +78,7 @@ def export(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
         ),
     ] = None,
     json: JsonOption = False,

@@ -94,7 +94,7 @@ def repair(
 
 
 def doctor(json: JsonOption = False) -> None:
-    """Say what is installed, what is missing, and what that means.
+    """Check what is installed, what is missing, and what does not work without it.
 
     Example: list3r doctor
     """

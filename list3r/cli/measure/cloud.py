@@ -52,7 +52,7 @@ class CloudArguments:
         typer.Option("--path", metavar="TRAJECTORY", help="Camera path of the estimate, if it is not a memory."),
     ] = None
     scale: ScaleOption = "auto"
-    threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05
+    threshold: Annotated[float, typer.Option("--threshold", help="Distance threshold of the F-score, metres.")] = 0.05
     truncate: Annotated[
         float | None, typer.Option("--truncate", help="Cap each distance at this, metres; default: no cap.")
     ] = None
