@@ -119,7 +119,7 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
         options = asked.options_of(fields)
     except TypeError as error:
         unknown = next((name for name in fields if repr(name) in str(error)), ", ".join(fields))
-        raise OptionError(f"{at}: {unknown} is no option of a source; see `list3r build -h`") from None
+        raise OptionError(f"{at}: {unknown} is not an option of a source; see `list3r build -h`") from None
     except List3rError as error:
         raise OptionError(f"{at}: {error}") from error
     settings = [asdict(options), asdict(asked.request), _shaping(asked.run)]

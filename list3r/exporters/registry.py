@@ -140,7 +140,7 @@ def export(
 def find_format(name: str) -> Format:
     """Return a format. Raises `OptionError` that names the known ones."""
     if name not in FORMATS:
-        raise OptionError(f"unknown format {name!r}; there are {', '.join(FORMATS)}")
+        raise OptionError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}")
     return FORMATS[name]
 
 

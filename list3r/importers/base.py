@@ -75,7 +75,7 @@ def read_json_file(path: Path) -> Any:
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check the file") from None
     except ValueError as error:
-        raise SourceError(f"{path} is not JSON that can be read ({error}); was it copied whole?") from None
+        raise SourceError(f"{path} is not JSON that can be read ({error}); is the copy complete?") from None
 
 
 def box_surface(box: OrientedBox) -> NDArray[np.float32]:
@@ -96,5 +96,5 @@ def vector(value: object, where: str) -> NDArray[np.float64]:
     except (TypeError, ValueError):
         out = np.zeros(0)
     if out.shape != (3,) or not np.isfinite(out).all():
-        raise SourceError(f"{where} is not three numbers; mend or remove it")
+        raise SourceError(f"{where} is not three numbers; fix or remove it")
     return out

@@ -125,7 +125,7 @@ def _box(box: object, where: str) -> OrientedBox | None:
         try:
             rotation = Rotation.from_quat([float(turn[k]) for k in "xyzw"]).as_matrix()
         except (KeyError, TypeError, ValueError):
-            raise SourceError(f"{where}: world_R_center is not a rotation; mend or remove it") from None
+            raise SourceError(f"{where}: world_R_center is not a rotation; fix or remove it") from None
     return OrientedBox(center, np.maximum(np.abs(size), 0.01), rotation)
 
 

@@ -95,4 +95,4 @@ def naming_extras() -> Iterator[None]:
         if module not in EXTRA_OF_PACKAGE:
             raise
         install = f"pip install 'list3r[{EXTRA_OF_PACKAGE[module]}]'"
-        raise MissingPackageError(f"this takes {module}, which is not installed: {install}") from None
+        raise MissingPackageError(f"this needs {module}, which is not installed: {install}") from None

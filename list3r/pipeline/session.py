@@ -406,7 +406,7 @@ def _check_prior(info: SourceInfo, reconstruction: str) -> None:
 def check_agreement(source: FrameSource) -> None:
     """Raise `SourceError` where given poses contradict what the frames show."""
     for found in disagreements(source):
-        raise SourceError(f"{source.info.path}: {found}; mend that, or use --poses estimate, which does without poses")
+        raise SourceError(f"{source.info.path}: {found}; fix that, or use --poses estimate, which needs no poses")
 
 
 def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:

@@ -161,7 +161,7 @@ def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
     if point.shape != (3,) or not np.isfinite(point).all():
         raise OptionError(f"{name} must be three finite numbers x, y, z, not {value!r}")
     if np.abs(point).max() > _FARTHEST:
-        raise OptionError(f"{name} {value!r} lies beyond {_FARTHEST:g}, where distances are no numbers any more")
+        raise OptionError(f"{name} {value!r} is too far away; distances up to {_FARTHEST:g} can be computed")
     return point
 
 

@@ -80,11 +80,11 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         raise OptionError(f"{folder} has no {MANIFEST}; see docs/precomputed.md, or write it with `list3r precompute`")
     if path.stat().st_size > _MAX_MANIFEST:
-        raise OptionError(f"{path} is {path.stat().st_size} bytes long and no manifest")
+        raise OptionError(f"{path} is {path.stat().st_size} bytes long and not a manifest")
     try:
         said = parse_json(read_file(path, _MAX_MANIFEST))
     except (ValueError, RecursionError) as error:
-        raise OptionError(f"{path} is no JSON ({str(error).splitlines()[0][:120]}); see docs/precomputed.md") from None
+        raise OptionError(f"{path} is not JSON ({str(error).splitlines()[0][:120]}); see docs/precomputed.md") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("version") != VERSION:
         raise OptionError(f'{path} must say "format": "{FORMAT}", "version": {VERSION}')
     if said.get("scale") not in ("metric", "relative"):

@@ -55,7 +55,7 @@ class HttpSettings:
         if not 0 <= self.port <= 65535:
             raise OptionError(f"port {self.port} must lie between 0 and 65535")
         if self.token and len(self.token) < 16:
-            raise OptionError("the token is too short to keep anybody out; give at least 16 characters")
+            raise OptionError("the token is too short to be safe; give at least 16 characters")
 
 
 class _OneToken:

@@ -76,7 +76,7 @@ class NearArguments:
         from list3r.memory.errors import OptionError
 
         if self.words is None and self.point is None and self.id is None:
-            raise OptionError("say near what: --point x,y,z, --id ID, or words such as mug")
+            raise OptionError("give what to be near to: --point x,y,z, --id ID, or words such as mug")
         return None if self.point is None else parse_point(self.point, "--point")
 
 

@@ -95,7 +95,7 @@ def similar(
 
     with open_memory(memory, filters.min_confidence) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
-            raise OptionError("say what to compare with: --id ID, or --image FILE, with --box for a part of it")
+            raise OptionError("give what to compare with: --id ID, or --image FILE, with --box for a part of it")
         if like.image is not None:
             found = scene.similar_to_picture(like.image, k, box_xyxy=like.corners(), **filters.options())
         else:

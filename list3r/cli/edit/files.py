@@ -39,7 +39,7 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         say(f"`list3r repair {memory}` saves what is sound")
     else:
         unfinished = (
-            "; the build is unfinished, go on with --resume" if any(s["state"] == "building" for s in state) else ""
+            "; the build is unfinished, continue with --resume" if any(s["state"] == "building" for s in state) else ""
         )
         say(f"{memory} is sound: {chunks} chunks{unfinished}")
     if beside and not json:

@@ -112,7 +112,7 @@ def _message(phone: socket.socket) -> bytearray:
     while length == 0:
         length = _OUTER.unpack(receive(phone, _OUTER.size))[3]
     if length > _MOST_BYTES:
-        raise LostError(f"what came is not a frame of Record3D: {length} bytes")
+        raise LostError(f"the data received is not a frame of Record3D: {length} bytes")
     return receive(phone, length)
 
 
@@ -120,16 +120,16 @@ def _parsed(body: bytearray) -> _PhoneFrame:
     """Return what a message says. Raises `LostError` where it is no frame, `SourceError` for the front camera."""
     start = _HEADER.size + _FLOATS.size
     if len(body) < start:
-        raise LostError("what came is not a frame of Record3D 1.10 or newer")
+        raise LostError("the data received is not a frame of Record3D 1.10 or newer")
     *sizes, jpeg, depth, confidence, misc, kind = _HEADER.unpack_from(body)
     numbers = _FLOATS.unpack_from(body, _HEADER.size)
     pixels = [sizes[k] * sizes[k + 1] for k in (0, 2, 4)]
     fits = start + jpeg + depth + confidence + misc == len(body) and jpeg > 0
     fits = fits and pixels[0] > 0 and 0 < pixels[1] <= MOST_DEPTH_PIXELS and pixels[2] <= MOST_DEPTH_PIXELS
     if not (fits and np.isfinite(numbers[:4]).all() and min(numbers[:2]) > 0):
-        raise LostError("what came is not a frame of Record3D 1.10 or newer")
+        raise LostError("the data received is not a frame of Record3D 1.10 or newer")
     if kind == _FRONT_CAMERA:
-        raise SourceError("the phone streams its front camera, which knows no poses: choose LiDAR in Record3D")
+        raise SourceError("the phone streams its front camera, which has no poses: choose LiDAR in Record3D")
     files, at = {}, start
     for ending, size in ((".jpg", jpeg), (".depth", depth), (".conf", confidence)):
         files[ending] = bytes(body[at : at + size])

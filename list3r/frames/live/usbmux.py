@@ -66,7 +66,7 @@ def receive(connection: socket.socket, count: int) -> bytearray:
                 raise LostError("it was closed")
             held += more
     except TimeoutError:
-        raise LostError("nothing came") from None
+        raise LostError("no data came") from None
     except OSError as error:
         raise LostError(error.strerror or str(error)) from None
     return data

@@ -175,8 +175,8 @@ def _opened(path: Path, stream: str) -> Any:
             from projectaria_tools.core.stream_id import StreamId
     except ImportError:
         raise OptionError(
-            f"{path} is a recording of Aria, which takes: pip install 'list3r[aria]' (or, without what its tools draw "
-            "with: pip install --no-deps projectaria-tools)"
+            f"{path} is a recording of Aria, which needs a package: pip install 'list3r[aria]' (or, without its "
+            "drawing tools: pip install --no-deps projectaria-tools)"
         ) from None
     try:
         with _quiet():
@@ -184,7 +184,7 @@ def _opened(path: Path, stream: str) -> Any:
     except RuntimeError as error:
         raise SourceError(f"{path} cannot be read ({str(error).splitlines()[0]}); copy it again") from None
     if provider is None:
-        raise SourceError(f"{path} is not a recording in VRS that can be read; was the copy finished?")
+        raise SourceError(f"{path} is not a recording in VRS that can be read; is the copy complete?")
     streams = [str(s) for s in provider.get_all_streams()]
     if stream not in streams or not provider.get_num_data(StreamId(stream)):
         raise SourceError(f"{path} has no pictures in the stream {stream}, but {', '.join(streams) or 'none'}")

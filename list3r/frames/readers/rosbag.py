@@ -55,7 +55,7 @@ def is_recording(path: Path) -> bool:
     """
     packed = [path] if path.is_file() else [p for end in ENDINGS for p in path.glob(f"*{end}{_PACKED}")]
     if any(p.name.endswith(tuple(end + _PACKED for end in ENDINGS)) for p in packed):
-        raise SourceError(f"{path} is packed as a whole: unpack it (`zstd -d --rm {packed[0]}`), and give it again")
+        raise SourceError(f"{path} is compressed as a whole: unpack it (`zstd -d --rm {packed[0]}`), and give it again")
     if path.is_dir():
         return bool(_files(path))
     return path.suffix.lower() in ENDINGS or path.name.endswith(".bag.active")
@@ -238,7 +238,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise OptionError(f"{path} is a ROS recording, which takes: pip install 'list3r[ros]'") from None
+        raise OptionError(f"{path} is a ROS recording, which needs a package: pip install 'list3r[ros]'") from None
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):

@@ -42,7 +42,7 @@ class DepthCode:
         logarithmic = bool(info.get("video.use_log", True))
         numbers = all(isinstance(v, int | float) and math.isfinite(v) for v in (least, most, shift))
         if not numbers or not 0 <= least < most or (logarithmic and least + shift <= 0):
-            raise SourceError(f"depth is coded from {least} to {most} m, shifted by {shift}; mend meta/info.json")
+            raise SourceError(f"depth is coded from {least} to {most} m, shifted by {shift}; fix meta/info.json")
         return cls(float(least), float(most), float(shift), logarithmic)
 
     def metres(self, codes: NDArray[Any]) -> NDArray[np.float32]:

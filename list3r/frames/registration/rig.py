@@ -128,7 +128,7 @@ def build_rig(
     Frames larger than `max_side` are reduced, and the camera with them; see `SourceOptions.max_side`.
     """
     if optics.distortion and optics.intrinsics is None:
-        raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
+        raise SourceError("a lens distortion needs a camera; give --intrinsics fx,fy,cx,cy")
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
     if optics.intrinsics is not None and not optics.by_user:

@@ -59,7 +59,7 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
     with store.transaction():
         first, second = sorted((store.ids.resolve(a), store.ids.resolve(b)))
         if first == second:
-            raise OptionError(f"{a} and {b} are one instance already, #{first}")
+            raise OptionError(f"{a} and {b} are already one instance, #{first}")
         if store.instances.get(first).component != store.instances.get(second).component:
             raise OptionError(
                 f"#{first} and #{second} lie in parts of the memory that were never joined, each with its own frame of "
@@ -130,7 +130,7 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
     """Take back an edit, or a decision of the merge log, by its entry; the last edit that stands without one.
 
     Undoing an undo brings the edit back. Ids that had retired come back. Raises `OptionError` for an entry that there
-    is not, that is undone already, or that decided nothing.
+    is not, that is already undone, or that decided nothing.
     """
     with store.transaction():
         edits = store.edits.all()
@@ -144,7 +144,7 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
         if chosen is None:
             return _undo_decision(store, entry, author)
         if chosen not in in_force:
-            raise OptionError(f"entry {entry} is undone already; undo the undo to bring it back")
+            raise OptionError(f"entry {entry} is already undone; undo the undo to bring it back")
         touched = sorted({k for _, _, keys in chosen.before for k in keys})
         edit = replace(_edit("undo", (), _owners(store, touched), author), target=entry)
         what = f"the undo of entry {chosen.target}" if chosen.kind == "undo" else f"the {chosen.kind}"
@@ -164,7 +164,7 @@ def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
         raise OptionError(f"the log has no entry {entry}; `list3r merges {store.path}` shows all")
     d = found.decision
     if d.kind not in ("merge", "refuse"):
-        raise OptionError(f"entry {entry} ({d.kind}) only tells what became of ids; undo the merge that led to it")
+        raise OptionError(f"entry {entry} ({d.kind}) only records what became of ids; undo the merge that led to it")
     a, b = _key(d.a, found), _key(d.b, found)
     before = _owners(store, [a, b])
     one = len(before) == 1 and len(before[0][2]) > 0 and {a, b} <= set(before[0][2])

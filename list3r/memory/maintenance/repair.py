@@ -143,8 +143,8 @@ def _copy(path: Path, copy: Path) -> None:
         free = shutil.disk_usage(copy.parent).free
         if 2 * size > free:
             raise MemoryFileError(
-                f"{path} takes {size / 1e6:.0f} MB, and so does what is saved of it; {copy.parent.parent} has "
-                f"{free / 1e6:.0f} MB free: free some space, or name another folder by --out"
+                f"{path} takes {size / 1e6:.0f} MB, and so may its repaired copy; {copy.parent.parent} has only "
+                f"{free / 1e6:.0f} MB free: free some space, or name another folder with --out"
             )
         for end in ("", "-wal", "-journal"):
             if Path(f"{path}{end}").exists():

@@ -83,7 +83,7 @@ class Worker:
             return WorkerError(f"a worker process ended with status {status}; what it said stands above")
         return WorkerError(
             f"a worker process was ended from outside (signal {-status}), most likely for want of memory; "
-            "go on with --resume and fewer --workers"
+            "continue with --resume and fewer --workers"
         )
 
 
