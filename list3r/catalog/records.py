@@ -64,7 +64,7 @@ class CatalogThing:
     component: int
     box: OrientedBox
     words: dict[str, int]
-    """Words that it bears, with how well each names it, in hundredths; empty in answers."""
+    """Words that it has, with how well each names it, in hundredths; empty in answers."""
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """Return the lower and upper corner of its axis-aligned box, world units."""
@@ -124,7 +124,7 @@ class Wanted:
     """Instances that a question asks for: by words or an id, and how they stand to others."""
 
     words: tuple[str, ...] = ()
-    """All of which it must bear."""
+    """All of which it must have."""
     instance_id: int | None = None
     where: tuple[tuple[tuple[str, ...], Wanted], ...] = ()
     """Predicates, of which one must hold, and the object."""

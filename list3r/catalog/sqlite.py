@@ -74,12 +74,12 @@ class SqliteBackend:
     def _tables(self) -> bool:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
-    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+    def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name."""
         with self._writing():
             known = self.memories([content.entry.name])
             before = known[0] if known else content.entry
-            if known and not anew and replace(content.entry, revision=before.revision) == before:
+            if known and not again and replace(content.entry, revision=before.revision) == before:
                 return before
             same = bool(known) and before.sha256 == content.entry.sha256
             entry = replace(content.entry, revision=before.revision + (not same))
@@ -115,7 +115,7 @@ class SqliteBackend:
 
     @contextlib.contextmanager
     def loading(self, *, many: bool) -> Iterator[None]:
-        """Write memories: nothing is to be made anew here."""
+        """Write memories: nothing is to be made again here."""
         yield
 
     def drop(self, name: str) -> bool:
@@ -328,7 +328,7 @@ def _columns_of(t: CatalogThing) -> tuple[object, ...]:
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
-    """Over all memories: what bears a word is looked up."""
+    """Over all memories: what has a word is looked up."""
     one = f"{alias}.number IN (SELECT number FROM word WHERE word = ?)"
     return " AND ".join([one] * len(words)), list(words)
 

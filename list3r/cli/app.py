@@ -1,6 +1,6 @@
 """The program `list3r`: its commands, and the one place where errors become one line and an exit status.
 
-Status 0: done. 1: the program failed, was interrupted, or a check found damage. 2: the input is wrong, and how to mend
+Status 0: done. 1: the program failed, was interrupted, or a check found damage. 2: the input is wrong, and how to fix
 it is said.
 """
 

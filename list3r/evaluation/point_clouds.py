@@ -122,7 +122,7 @@ def _read_mesh(path: Path) -> tuple[Any, Any, str]:
 
 
 def thinned(cloud: PointCloud, voxel_m: float, most: int | None = None) -> PointCloud:
-    """Return one point for each occupied cell of a grid: mean of its points and of their normals; then at most so many.
+    """Return one point for each occupied cell of a grid, the mean of its points and normals, and at most `most`.
 
     The mean hides no error larger than the cell, and makes two clouds of different density comparable.
     """

@@ -34,9 +34,9 @@ class GlbSettings:
     color: str = "rgb"
     """Of the points. rgb: the colours that were seen; instance: one colour an instance, the same in every export."""
     points_per_instance: int = 5000
-    """At most so many points of a thing."""
+    """At most this many points of a thing."""
     points_per_structure: int = 20000
-    """At most so many points of a floor, a wall and the like."""
+    """At most this many points of a floor, a wall and the like."""
 
     def __post_init__(self) -> None:
         if self.color not in ("instance", "rgb"):

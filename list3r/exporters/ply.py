@@ -40,7 +40,7 @@ class PlySettings:
     structure: bool = True
     """Whether floor, walls and the like are written too."""
     points_per_instance: int | None = None
-    """At most so many points of each instance, all of them for None."""
+    """At most this many points of each instance, all of them for None."""
 
     def __post_init__(self) -> None:
         if self.color not in ("instance", "rgb"):

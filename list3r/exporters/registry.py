@@ -20,7 +20,7 @@ Writer = Callable[..., tuple[Path, ...]]
 
 
 class ExportOptions(TypedDict, total=False):
-    """What may be asked of formats; each has some of them, None is its default."""
+    """Options of formats; each has some of them, None is its default."""
 
     color: str | None
     tokens: int | None
@@ -52,7 +52,7 @@ class Format:
     settings: str = ""
     """The dataclass of its options."""
     address_space_mb: int = 0
-    """Address space that its libraries take, MiB; 0 where it is nothing to speak of."""
+    """Address space that its libraries take, MiB; 0 where it is negligible."""
     options: tuple[str, ...] = ()
     """Fields of the settings that can be asked for, see `ExportOptions`."""
 

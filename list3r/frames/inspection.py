@@ -128,7 +128,7 @@ def _depth_text(info: SourceInfo) -> str:
 
 
 def _poses_text(info: SourceInfo) -> str:
-    """Return whether there are poses, and what a build makes of them unless it is told otherwise."""
+    """Return whether there are poses, and what a build makes of them by default."""
     if not info.has_poses:
         return "none; build estimates them"
     if info.poses_drift and info.poses_metric and info.has_depth:

@@ -184,7 +184,7 @@ def check_rigid(matrix: NDArray[np.float64], name: str = "transform") -> NDArray
 
 
 def parse_numbers(text: str, name: str) -> list[float]:
-    """Numbers parted by commas, semicolons or white space. Raises `OptionError` naming the word that is none."""
+    """Numbers separated by commas, semicolons or white space. Raises `OptionError` naming the word that is none."""
     words = text.replace(",", " ").replace(";", " ").split()
     out = []
     for word in words:

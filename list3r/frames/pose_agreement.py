@@ -1,7 +1,7 @@
 """Whether given poses fit what the frames show: depth of one frame, seen from another, must meet its depth.
 
 Recorders differ in the axes of a camera and in which way a pose leads; a wrong guess still runs, and makes a world of
-nonsense. What fits far better in another convention is told apart here from poses that merely drift. So is depth in
+nonsense. What fits far better in another convention is distinguished here from poses that merely drift. So is depth in
 another unit: where the camera moves by known metres, what it sees moves by as many pixels as it is far. Without depth,
 corners that are found again must lie on the lines that the poses leave them. `disagreements` is all of it in words.
 """
@@ -35,7 +35,7 @@ class AgreementSettings:
     """Motion that tells conventions apart, or"""
     least_shift_m: float = 0.08
     stride: int = 6
-    """Every so many-th pixel is compared."""
+    """Spacing of the pixels that are compared."""
     tolerance: float = 0.05
     """Depth that differs by less than this share agrees."""
     least_points: int = 100
@@ -44,11 +44,11 @@ class AgreementSettings:
     epipolar_px: float = 2.0
     """What moved is as far from where its pose lets it be, whatever its depth; matches beyond are false."""
     parallax_px: float = 5.0
-    """What moved by less, as against something far away, tells nothing of its depth."""
+    """What moved by less, as against something far away, says nothing of its depth."""
     least_matches: int = 15
     """Of all pairs together."""
     factor: float = 1.6
-    """Depth that is as many times off is told; a wrong focal length alone makes less."""
+    """Depth that is this many times off is reported; a wrong focal length alone makes less."""
     spread: float = 0.25
     """Six of ten matches must agree on one factor within this share."""
     relief: float = 0.08

@@ -1,4 +1,4 @@
-"""Which frames of a source are handed out: from when to when, every how many, and which one of each so many."""
+"""Which frames of a source are handed out: from when to when, every N-th, and which one of each group."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def select(
     """Return the frames that the options leave of a source.
 
     `times_s` (F,) are the frames' times, ascending, from the source's `clock` or made up from a frame rate. With a
-    clock, `fps` thins the frames out to so many a second. Of a thinned video the sharpest frames are taken unless the
+    clock, `fps` thins the frames out to this many a second. Of a thinned video the sharpest frames are taken unless the
     options say otherwise. Raises `OptionError` when no frame is left.
     """
     count = len(times_s)

@@ -13,7 +13,7 @@ _TOUCH_M = 0.04
 _SHARE = 0.7
 """Of a thing's footprint that lies on what it stands on."""
 _LEAST, _TIMES = 4, 2.0
-"""Another axis is up where so many things stand along it, and so many times more than along the stated one."""
+"""Another axis is up where this many things stand along it, and this many times more than along the stated one."""
 _MOST_THINGS = 1500
 
 

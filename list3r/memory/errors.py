@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class List3rError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it in one line and exits with 2."""
+    """Base of every error that the user can fix; the command line prints it in one line and exits with 2."""
 
 
 class SourceError(List3rError):

@@ -74,7 +74,7 @@ def find(
 
 def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
     """Return what words alone name in a large memory, of which only the answers are read; None for all other
-    questions, and where nothing bears the words.
+    questions, and where no instance has the words.
     """
     words, more = phrase.words, (phrase.where, phrase.size, phrase.superlative)
     if not words or any(more) or phrase.instance_id is not None or not is_large(store):
@@ -142,7 +142,7 @@ def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
 
 
 def _vocabulary(i: Instance) -> dict[str, float]:
-    """Return words that an instance bears, with how well each names it."""
+    """Return words that an instance has, with how well each names it."""
     return vocabulary(i.label, i.structure, i.description, i.color_name)
 
 
@@ -172,7 +172,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
 
 
 def _unknown(search: PhraseSearch, words: Sequence[str]) -> list[str]:
-    """Return words that nothing bears."""
+    """Return words that no instance has."""
     if search.gathered is not None:
         known = search.store.words.known(words)
         return [w for w in words if w not in known]

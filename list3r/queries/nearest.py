@@ -44,10 +44,10 @@ def nearest(
 ) -> Matches:
     """Find the k instances nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
-    With `words` only things whose label or description bears one of them; with words alone those that they name best,
-    then the surest, without distances. The words must all be found where any thing bears them all. Words that say more
+    With `words` only things whose label or description has one of them; with words alone those that they name best,
+    then the surest, without distances. The words must all be found where any thing has them all. Words that say more
     than names (a relation, a size, an id: "small mug on the table") mean what they mean to `find`. Words that name a
-    kind of structure ("floor", "wall") ask for structure too. Words that nothing bears are compared by the vectors of
+    kind of structure ("floor", "wall") ask for structure too. Words that no instance has are compared by the vectors of
     an `encoder` whose space the memory holds. `max_distance` bounds the distance between
     surfaces. What moves is taken where it was last seen; near an instance only what shares its component answers. For
     the filters see `Filters`. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that
@@ -153,10 +153,10 @@ def _match(
 ) -> Match:
     """Return an answer, with its distance in words."""
     if origin is not None:
-        offset, whence = i.center - origin.center, f"from #{origin.id}"
+        offset, reference = i.center - origin.center, f"from #{origin.id}"
     else:
         assert place is not None
-        offset, whence = i.center - place, "from the point"
+        offset, reference = i.center - place, "from the point"
     center = math.sqrt(offset.dot(offset))
-    reason = f"surface {surface:.2f}, centre {center:.2f} {whence}" + (f", {named}" if named else "")
+    reason = f"surface {surface:.2f}, centre {center:.2f} {reference}" + (f", {named}" if named else "")
     return Match(i, round(1.0 / (1.0 + surface), 4), surface, center, reason)

@@ -234,8 +234,8 @@ def noise_of(store: Store) -> float:
 
 
 def unit_of(store: Store) -> float:
-    """Estimate what a metre is in world units: 1 where the memory is metric, else told by the distances of things from
-    the cameras, which stand about two metres from what they look at indoors.
+    """Return what a metre is in world units: 1 if the memory is metric, else an estimate from the distances of things
+    from the cameras, which stand about two metres from what they look at indoors.
     """
     if store.facts.scale_kind != "relative":
         return 1.0

@@ -74,7 +74,7 @@ class _OneToken:
 def make_server(served: SceneMemory | Catalog, *, http: HttpSettings | None = None) -> MCPServer[Any]:
     """Return the server of a catalogue or of a memory, with tools that edit where the memory is open for writing.
 
-    With `http` (port and token given) clients must bear the token.
+    With `http` (port and token given) clients must send the token.
     """
     guard: dict[str, Any] = {}
     if http is not None:
@@ -108,7 +108,7 @@ def serve_stdio(served: SceneMemory | Catalog) -> None:
 def serve_http(served: SceneMemory | Catalog, settings: HttpSettings, started: Callable[[str, str], None]) -> None:
     """Serve clients of this machine over streamable HTTP until interrupted.
 
-    `started` is told the address and the token once the server listens. A request must bear the token, name this host
+    `started` gets the address and the token once the server listens. A request must carry the token, name this host
     and come from no foreign web page. Raises `OptionError` where the port is taken.
     """
     import uvicorn
@@ -139,7 +139,7 @@ def _listen(port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, port))
-        listener.listen()  # who is told the address may come before the server is ready
+        listener.listen()  # whoever gets the address may connect before the server is ready
     except OSError as error:
         listener.close()
         raise OptionError(f"port {port} of {HOST} cannot be used ({error.strerror}); choose another one") from error
@@ -153,7 +153,7 @@ def _public_methods(tools: object) -> Iterator[Callable[..., Any]]:
 
 
 def _with_errors(tool: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the same tool; errors that the user can mend reach the agent as one line."""
+    """Return the same tool; errors that the user can fix reach the agent as one line."""
 
     @functools.wraps(tool)
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -99,7 +99,7 @@ class Viewer:
                 self.panel.follow(self.state)
 
     def reload(self) -> None:
-        """Read the memory anew, after an edit."""
+        """Read the memory again, after an edit."""
         with self._lock:
             self.world = self._read()
             if self.state.selected not in self.world.instances:

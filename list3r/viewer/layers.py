@@ -30,7 +30,7 @@ class LayerSettings:
 
 
 class Layers:
-    """The scene of one server; every layer is drawn anew when what it shows changes."""
+    """The scene of one server; every layer is drawn again when what it shows changes."""
 
     def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
         self._scene, self._settings = server.scene, settings

@@ -47,7 +47,7 @@ def extend(
 ) -> GraphResult:
     """Place one more chunk in a graph whose other chunks lie as `placed` says (as `optimize` or `extend` put them).
 
-    A chunk that hangs on one edge is chained: that is the optimum. One with loops that agree with the map is fitted to
+    A chunk with a single edge is chained: that is the optimum. One with loops that agree with the map is fitted to
     it alone; if its edges do not fit then, the chunks on the way that the loops close and those near them move by a
     Gauss-Newton step; if it joins components, all are solved from the beginning. Only the edges of the new chunk are
     judged, and covariances of the others stay: `optimize` at the end of a session judges all.

@@ -35,7 +35,7 @@ from list3r.memory.records import Edge
 Array = NDArray[np.float64]
 
 _NOTHING = 1e9
-"""Variance factor of edges that are not believed, so that what hangs on them alone stays put."""
+"""Variance factor of edges that are not believed, so that what they alone join stays where it is."""
 _STEPS = 10
 """Most steps of the solution; it starts near."""
 

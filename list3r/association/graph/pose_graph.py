@@ -68,7 +68,7 @@ def optimize(
     metric: bool,
     settings: GraphSettings | None = None,
 ) -> GraphResult:
-    """Place all chunks. The first chunk of each component stays at `initial`, or at the origin where that is silent.
+    """Place all chunks. The first chunk of each component stays at `initial`, or at the origin if it is not in it.
 
     Edges that geometry did not accept are passed through; those that an earlier call rejected are tried again. Raises
     `DegenerateError` for an edge that holds a number that is not finite.

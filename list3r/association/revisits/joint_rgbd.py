@@ -17,7 +17,7 @@ from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 class RgbdJointReconstructor:
     """A `JointReconstructor` that reads the sessions' sources, opened when a window is first asked for.
 
-    By session id `paths` are those of the sources, `options` what it was built with; the defaults where that is silent.
+    By session id, `paths` are those of the sources and `options` those of the build; defaults if not set.
     """
 
     def __init__(

@@ -254,7 +254,7 @@ class RevisitSearch:
             edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification, later=later)
             edge = _objected(edge, objection)
         if joint is None or (edge is not None and (edge.accepted or not self._second_opinions)):
-            edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
+            edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is available")
         else:
             self._second_opinions -= edge is not None
             edge = joint_edge(joint, *self.ends(c), objection, self._settings.window)

@@ -40,7 +40,7 @@ class TieSettings:
     apart: FramesApart = field(default_factory=FramesApart)
     """When relations of the same two chunks are two."""
     sure_features: int = 60
-    """One relation is beyond doubt when so many features agree on it,"""
+    """One relation is beyond doubt when this many features agree on it,"""
     sure_overlap: float = 0.6
     """both sides see this share of the same surfaces,"""
     sure_agreement: float = 0.97

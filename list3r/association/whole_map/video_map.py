@@ -29,7 +29,7 @@ from list3r.reconstruction.sfm.two_view import verified_rows
 Array = NDArray[np.float64]
 
 _IDS = 1_000_000
-"""Features of the first frame are numbered from here on; those of every frame have so many numbers."""
+"""Features of the first frame are numbered from here on; those of every frame have this many numbers."""
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
 
 
 def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:
-    """What is told of a moving thing: when, how far, from where to where."""
+    """Fields of a moving thing: when, how far, from where to where."""
     if not len(times_s):
         return [("moved", "seen moving; where it was is not known")]
     way = sum(math.dist(a, b) for a, b in itertools.pairwise(places.tolist()))

@@ -46,7 +46,7 @@ def watching(
 
 
 def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
-    """Return what moves a progress bar while a video is looked at before its chunks; then it begins anew as `then`."""
+    """Return what moves a progress bar while a video is looked at before its chunks; then it begins again as `then`."""
     now = then
 
     def look(what: str, done: int, total: int) -> None:
@@ -65,7 +65,7 @@ def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
 def say_result(
     memory: Path, work: Callable[[], Report], lines: Callable[[Path, Report], list[str]], json: bool
 ) -> None:
-    """Do the work and print its report. What failed after the memory was written is raised when that is told."""
+    """Do the work and print its report. What failed after the memory was written is raised after that is printed."""
     from list3r.pipeline.finishing import FinishingError
 
     failure = None

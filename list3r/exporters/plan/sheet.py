@@ -20,7 +20,7 @@ from list3r.memory.records import Instance
 INK: Color = (38, 42, 52)
 GREY: Color = (120, 124, 134)
 OVERSAMPLING = 2
-"""Drawn so many times larger and averaged down: Pillow does not smooth its lines."""
+"""Drawn this many times larger and averaged down: Pillow does not smooth its lines."""
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 

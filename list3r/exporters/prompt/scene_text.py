@@ -37,7 +37,7 @@ class PromptSettings:
     share_of_counts: float = 0.5
     """Counts take at most this share of what the rows have left."""
     neighbours: int = 2
-    """Nearest things that are told of each thing."""
+    """Nearest things that are listed for each thing."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class ScenePrompt:
 def scene_prompt(
     memory: SceneMemory, tokens: int = 2000, question: str | None = None, settings: PromptSettings | None = None
 ) -> ScenePrompt:
-    """Return the text of a memory in at most so many tokens, see `SceneMemory.prompt`."""
+    """Return the text of a memory in at most this many tokens, see `SceneMemory.prompt`."""
     settings = settings or PromptSettings()
     things = [i for i in memory.instances(structure=None) if i.state != "removed"]
     ranked = ranked_instances(memory, things, question)

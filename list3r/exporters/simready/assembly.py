@@ -26,7 +26,7 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class SimreadySettings:
-    """What props are told to be, and how they are made."""
+    """What is written about props, and how they are made."""
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for no mass and no rigid body."""

@@ -24,7 +24,7 @@ from list3r.memory.errors import OptionError, SourceError
 
 PORT = 1337
 _VARIES = 0.01
-"""Focal lengths that differ by a larger share are told of."""
+"""Focal lengths that differ by a larger share are reported."""
 _OUTER = struct.Struct(">4I")
 _HEADER = struct.Struct("<11I")
 _FLOATS = struct.Struct("<11f")

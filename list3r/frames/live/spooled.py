@@ -39,7 +39,7 @@ class StreamFeed:
     """A `Feed` of a live camera; a thread takes its pictures in."""
 
     def __init__(self, camera: LiveCamera, folder: Path, settings: LiveSettings, fps: float | None, tell: Tell) -> None:
-        """`fps` thins the pictures out to so many a second. `folder` is made, and must not exist."""
+        """`fps` thins the pictures out to this many a second. `folder` is made, and must not exist."""
         self.folder, self._camera, self._settings, self._tell = folder, camera, settings, tell
         self._least_gap_s = 0.0 if fps is None else 0.9 / fps
         self._lock = threading.Lock()

@@ -56,7 +56,7 @@ def connect(serial: str, port: int, timeout_s: float) -> socket.socket:
 
 
 def receive(connection: socket.socket, count: int) -> bytearray:
-    """Return so many bytes. Raises `LostError`."""
+    """Return this many bytes. Raises `LostError`."""
     data = bytearray(count)
     view, held = memoryview(data), 0
     try:

@@ -28,7 +28,7 @@ _EARLIER = 4
 
 
 class VideoSource:
-    """A `FrameSource` over one video stream. Every `read` opens the file anew and seeks to its first frame."""
+    """A `FrameSource` over one video stream. Every `read` opens the file again and seeks to its first frame."""
 
     def __init__(self, path: Path, options: SourceOptions, *, by_user: bool = True) -> None:
         """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`.
@@ -175,7 +175,7 @@ class VideoSource:
         if not self._stamps.clock:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
         if self._chosen.sharpest:
-            notes.append("of each so many frames the sharpest is taken; --no-sharpest takes the first")
+            notes.append("of each group of frames the sharpest is taken; --no-sharpest takes the first")
         missing = missing_parts(depth=False, camera=rig.camera is not None)
         focal = None if rig.camera is not None else self._stamps.focal_35mm
         height, width = rig.stored_size

@@ -2,7 +2,7 @@
 
 Both formats are sequences of records and end with an index, without which `rosbags` refuses them. Of an mcap
 (mcap.dev/spec) the end of a file without an index is put after the last whole record; of a ROS 1 bag
-(wiki.ros.org/Bags/Format/2.0) the index is made anew from its whole chunks. Nothing is written.
+(wiki.ros.org/Bags/Format/2.0) the index is made again from its whole chunks. Nothing is written.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def _mended_bag(
 
 
 def _is_indexed(file: BinaryIO, first: _Record, size: int) -> bool:
-    """Whether a bag has the whole index that its header speaks of."""
+    """Whether a bag has the whole index that its header refers to."""
     at, wanted = first.number(b"index_pos"), first.number(b"conn_count") + first.number(b"chunk_count")
     return 0 < at <= size and sum(1 for _ in _records(file, at, size)) >= wanted
 

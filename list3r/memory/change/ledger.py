@@ -1,7 +1,7 @@
-"""What was told of changes when a session last ended, in terms of local instances, which never change.
+"""The changes as found when a session last ended, in terms of local instances, which never change.
 
 Until the next session ends it stands: its chunks come to the library by overlap alone, what had moved stays one
-instance whose box is where it was last, and what had events stays shown. Then all is found anew (`change.detection`).
+instance whose box is where it was last, and what had events stays shown. Then all is found again (`change.detection`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ChangeLedger:
     """The matching of the sessions that have ended."""
 
     session: int
-    """The last session that it tells of."""
+    """The last session that it covers."""
     moved: tuple[MovedInstance, ...] = ()
     with_events: frozenset[Key] = frozenset()
     """A local instance of every instance that has an event."""
@@ -62,7 +62,7 @@ class ChangeLedger:
         return tuple(group)
 
     def keys(self) -> set[Key]:
-        """Return all local instances that it speaks of."""
+        """Return all local instances that it concerns."""
         return {k for m in self.moved for place in m.places for k in place} | self.with_events
 
     def joined(

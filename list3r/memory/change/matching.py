@@ -41,7 +41,7 @@ class _Move:
 
 
 class ChangeMatching:
-    """Tells what each session has changed; the result stands when all are told, in order."""
+    """Finds what each session has changed; the result is complete when all sessions were taken, in order."""
 
     def __init__(
         self, places: Places, found: OverlapGroups, constraints: Constraints, settings: ChangeSettings

@@ -6,7 +6,7 @@ import re
 from functools import lru_cache
 
 VERSION = 1
-"""Goes up with every change of what words an instance bears: the index of words in a file is then made anew."""
+"""Goes up with every change of what words an instance has: the index of words in a file is then made again."""
 
 _SYNONYMS = {
     "ground": "floor",
@@ -30,7 +30,7 @@ _SYNONYMS = {
 
 
 def vocabulary(label: str | None, structure: str | None, description: str, color_name: str) -> dict[str, float]:
-    """Return the words that an instance bears, singular and in one word for many, with how well each names it, in (0,
+    """Return the words that an instance has, singular and in one word for many, with how well each names it, in (0,
     1].
 
     Of the description only what stands before the first comma counts.

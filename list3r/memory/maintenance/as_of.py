@@ -1,8 +1,8 @@
-"""The memory as it was after an earlier session, for every question to be asked of.
+"""The memory as it was after an earlier session, for every question.
 
 A connection of its own to the same file, in which temporary tables and views stand before those of the file: nothing
 is written, what sessions saw later is not there, and what they moved is where it was. Sizes and words are those of
-today. Relations among what has not changed since are those of the file; the others are found anew.
+today. Relations among what has not changed since are those of the file; the others are found again.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Each is one transaction and one log entry.
 
-An edit is written down in terms of local instances (chunk:local), which never change; then the library is derived anew
+An edit is written down in terms of local instances (chunk:local), which never change; then the library is derived again
 under all edits that stand (`memory.constraints`), and so it is whenever a chunk arrives later.
 """
 
@@ -71,10 +71,10 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
 
 
 def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, author: str | None = None) -> EditReport:
-    """Say that an instance is two: `out`, local instances (chunk id, local id) of it, and the rest.
+    """Split an instance into two: `out`, local instances (chunk id, local id) of it, and the rest.
 
-    Without `out` it is parted where the evidence parts it best. The larger part keeps the id, the other gets a new one.
-    Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.
+    Without `out` it is split where the evidence is strongest. The larger part keeps the id, the other gets a new one.
+    Raises `UnknownIdError`, and `OptionError` when there is nothing to split or `out` is not a part of it.
     """
     with store.transaction():
         known = store.ids.resolve(instance_id)
@@ -230,7 +230,7 @@ def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -
 
 
 def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, bring_back: Before = ()) -> EditReport:
-    """Write the edit down, derive the library anew, and see to it that every id still resolves."""
+    """Write the edit down, derive the library again, and see to it that every id still resolves."""
     if any(not keys for _, _, keys in edit.before):
         raise OptionError(
             f"{store.path} does not hold the local instances of {names[0]}; only its label can be changed"

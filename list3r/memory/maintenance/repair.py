@@ -1,4 +1,4 @@
-"""A damaged memory to a sound one: every row that is as it was written is kept, the rest is derived anew or named."""
+"""A damaged memory to a sound one: every row that is as it was written is kept, the rest is derived again or named."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
 from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
-"""Tables that consolidation writes; a row lost there is written anew."""
+"""Tables that consolidation writes; a row lost there is written again."""
 _PASSING = ("settled", "overlaps", "members", "anchors", "redundant", "looks")
 """Tables that consolidation goes on with; without them it derives the library as a whole."""
 _OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
@@ -65,7 +65,7 @@ class RepairReport:
     lost: dict[str, list[str]] = field(default_factory=dict)
     """What could not be saved: by kind (chunks, frames, keyframes, ...), names such as `3` or `1:120`."""
     rebuilt: bool = False
-    """Whether instances and relations were derived anew from what was saved."""
+    """Whether instances and relations were derived again from what was saved."""
     chunks: int = 0
     """Chunks in the sound file."""
     instances: int = 0
@@ -234,14 +234,14 @@ class _Lost:
     keys: dict[str, dict[Row, None]] = field(default_factory=dict)
     unnamed: dict[str, int] = field(default_factory=dict)
     instances: set[int] = field(default_factory=set)
-    """Ids that the damaged file told of."""
+    """Ids that the damaged file names."""
 
     def add(self, table: str, key: Row) -> None:
         self.keys.setdefault(table, {})[key] = None
 
 
 def _salvage(damaged: sqlite3.Connection, store: Store, lost: _Lost) -> None:
-    """Write all rows that are as they were written, and what hangs together with them, into an empty store."""
+    """Write all rows that are as they were written, and what belongs to them, into an empty store."""
     tables = {name: table for name, table in summed_tables().items() if name not in _PASSING}
     kept = {name: _sound_rows(damaged, table, lost) for name, table in tables.items()}
     lost.instances = {key[0] for key in (*kept["instances"], *lost.keys.get("instances", ()))}
@@ -411,7 +411,7 @@ def _needs_deriving(lost: _Lost) -> bool:
 
 
 def _derive(store: Store) -> None:
-    """The library anew from the chunks: ids stay where the observations of an instance, or the row itself, stayed."""
+    """Derive the library again from the chunks: ids stay where the observations or the row of an instance stayed."""
     with store.transaction():
         if not store.chunks.all():
             for name in _DERIVED:

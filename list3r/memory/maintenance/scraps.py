@@ -1,4 +1,4 @@
-"""Scraps as instances: what is too seldom one thing to be listed, made of what chunks kept of it when somebody asks.
+"""Scraps as instances: what is too unlikely to be one thing to be listed, made on demand of what chunks kept of it.
 
 Nothing else is derived from scraps: what is listed, its relations and its changes are the same with and without them.
 """

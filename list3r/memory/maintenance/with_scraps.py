@@ -1,4 +1,4 @@
-"""The memory with what it keeps but does not list, for every question to be asked of."""
+"""The memory with what it keeps but does not list, for every question."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class VisibilitySettings:
-    """When depth speaks for a surface, and when for free space."""
+    """When depth is evidence for a surface, and when for free space."""
 
     tolerance_m: float = 0.025
     """How far a surface may lie from where it is stored: alignment of two sessions."""

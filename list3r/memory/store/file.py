@@ -127,7 +127,7 @@ def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None
 
 
 def write_empty(path: Path) -> None:
-    """Write a memory without rows, whole and on the disk before it bears its name. Raises `MemoryFileError`."""
+    """Write a memory without rows, whole and on the disk before it gets its name. Raises `MemoryFileError`."""
     new: Path | None = None
     try:
         descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-new-", dir=path.parent)
@@ -159,7 +159,7 @@ def taken(path: Path) -> str:
 
 
 def rename_exclusively(old: Path, new: Path) -> None:
-    """Give a file a name that nothing bears. Raises `FileExistsError`; without hard links the name is looked up."""
+    """Give a file a name that no file has. Raises `FileExistsError`; without hard links the name is looked up."""
     try:
         os.link(old, new, follow_symlinks=False)
     except FileExistsError:

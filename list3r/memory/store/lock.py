@@ -98,7 +98,7 @@ def _let_go(descriptor: int, path: Path, process: int, ours: bool) -> None:
 
 
 def _is_current(descriptor: int, path: Path) -> bool:
-    """Whether the file that was locked is still the one that bears the name: the last holder removes it."""
+    """Whether the file that was locked is still the one that has the name: the last holder removes it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.lstat())
     except OSError:

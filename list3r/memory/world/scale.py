@@ -139,7 +139,7 @@ def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
 def rescale(store: Store) -> None:
     """Scale the world by the anchors that stand now; nothing where they say what they said before.
 
-    Writes where chunks lie; the library is to be derived anew then.
+    Writes where chunks lie; the library is to be derived again then.
     """
     chunks = store.chunks.all()
     S_world_graph = store.facts.S_world_graph

@@ -135,7 +135,7 @@ class ThingSearch:
         return list(dict.fromkeys([*likely[: self._settings.places], *near]))[: self._settings.registered]
 
     def _outdone(self, edge: Edge, found: Sequence[Edge], chains: EdgeChains) -> Edge:
-        """Return an edge, rejected where about as much speaks for one that names another place."""
+        """Return an edge, rejected if there is about as much evidence for another place."""
         if not edge.accepted:
             return edge
         lead = float("inf")

@@ -1,7 +1,7 @@
 """Place a chunk of one session beside one of another by all keyframes of both, where much has changed in between.
 
 Few frames of a changed room in another light look alike, so every keyframe is compared with every other one. What was
-moved then speaks for wrong places, often with more keyframes than one; so relations that put the chunk at one place
+moved then supports wrong places, often with more keyframes than one; so relations that put the chunk at one place
 are taken together, and the whole of both chunks decides between the places (`chunk_agreement`, docs/decisions/0134).
 """
 
@@ -27,7 +27,7 @@ from list3r.memory.records import Edge, Keyframe
 Array = NDArray[np.float64]
 
 WITNESSED = "witnessed"
-"""Score of a relation that the whole of both chunks speaks for: how much of what both saw agrees, in [0, 1]."""
+"""Score of a relation that the whole of both chunks supports: how much of what both saw agrees, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class AllKeyframesSettings:
     least_agreement: float = 0.4
     """Share of those that must lie on a surface of the other, whichever way they face (`ChunkAgreement.agreement`)."""
     contradicted: float = 0.15
-    """With less of it a relation is contradicted, whatever else speaks for it."""
+    """With less of it a relation is contradicted, whatever else supports it."""
     margin: float = 0.15
     """By which another place must agree less."""
     kept: int = 6

@@ -1,7 +1,7 @@
 """Ask the whole of two chunks whether a relation is true: all that their keyframes saw, of which two saw little.
 
 A relation of two keyframes can rest on a thing that was moved, or that looks like another. Then walls, floor and all
-that stayed lie elsewhere: what one chunk saw hangs in the free space of the other. What the two keyframes saw
+that stayed lie elsewhere: what one chunk saw lies in the free space of the other. What the two keyframes saw
 themselves is left out, so that the rest is a witness of its own. Along two walls and the floor a room can be shifted
 and they still agree, so it counts how much agrees of what faces the way that agrees least (docs/decisions/0134).
 """
@@ -26,25 +26,25 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class ChunkAgreementSettings:
-    """When the whole of two chunks speaks for a relation."""
+    """When the whole of two chunks supports a relation."""
 
     points: int = 400
     """Most points of a keyframe that are looked for in the other chunk."""
     met_m: float = 0.02
     """A point lies on a surface within this and"""
     met_sigmas: float = 2.0
-    """so many deviations of the sensor's noise, where both"""
+    """this many deviations of the sensor's noise, where both"""
     least_cosine: float = 0.8
     """have about one direction."""
     through_m: float = 0.05
     """A point is seen through where depth lies further behind it than this and"""
     through_sigmas: float = 3.0
-    """so many deviations."""
+    """this many deviations."""
     near_m: float = 0.1
     """Nearer points are not looked at."""
     prior: float = 0.02
     """Share of all that was seen that is taken to face every way besides, and to agree as all of it does on average:
-    a few points tell nothing."""
+    a few points say nothing."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 

@@ -43,7 +43,7 @@ class Sessions:
         return found
 
     def put(self, session: Session) -> None:
-        """Write a session anew."""
+        """Write a session again."""
         self._rows.put([session])
 
     def complete(self, session_id: int) -> None:
