@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Un
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import List3rError, OptionError, naming_extras
+from list3r.memory.errors import List3rError, OptionError, check_share, naming_extras
 from list3r.memory.maintenance.editing import MemoryEdits
 from list3r.memory.store.store import Store
 
@@ -74,8 +74,8 @@ def open(
     >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
     >>> list3r.open("house.l3r", min_confidence=0.2).instances()
     """
-    if min_confidence is not None and not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    if min_confidence is not None:
+        check_share("min_confidence", min_confidence)
     if at is None and min_confidence is None:
         return SceneMemory(Store.open(path, writable=writable))
     if writable:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from list3r.exporters.output import check_target
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_choice
 from list3r.memory.room import USD_MB, check_address_space
 
 if TYPE_CHECKING:  # the command line reads the names of the formats before anything heavy is needed
@@ -139,8 +139,7 @@ def export(
 
 def find_format(name: str) -> Format:
     """Return a format. Raises `OptionError` that names the known ones."""
-    if name not in FORMATS:
-        raise OptionError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}")
+    check_choice("format", name, FORMATS)
     return FORMATS[name]
 
 

@@ -13,7 +13,7 @@ from list3r import __version__
 from list3r.importers.base import GRAY, IMPORTED, ImportedMap, ImportedThing
 from list3r.importers.registry import read_map
 from list3r.importers.standing import doubt_of_up
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.errors import MemoryFileError, OptionError, check_choice
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary, MaskTrack, Support
@@ -54,8 +54,7 @@ def import_map(path: str | Path, memory: str | Path, *, kind: str = "auto", up: 
     Raises `SourceError` for what is no such map, `OptionError`, and `MemoryFileError` for a memory that exists.
     """
     source, target = Path(path).expanduser(), Path(memory)
-    if up not in _TURNS:
-        raise OptionError(f"--up {up} is not known; choose {', '.join(_TURNS)}")
+    check_choice("--up", up, _TURNS)
     if target.exists():
         raise MemoryFileError(taken(target))
     found = read_map(source, kind)

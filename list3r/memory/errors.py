@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 
@@ -52,6 +52,18 @@ class MissingPackageError(List3rError):
 
 class ExportError(List3rError):
     """An export that cannot be written."""
+
+
+def check_choice(name: str, value: str, known: Collection[str]) -> None:
+    """Raise `OptionError` for a value that is none of the known ones."""
+    if value not in known:
+        raise OptionError(f"{name} {value} is not known; choose one of: {', '.join(known)}")
+
+
+def check_share(name: str, value: float) -> None:
+    """Raise `OptionError` for a share that is not in [0, 1]."""
+    if not 0.0 <= value <= 1.0:
+        raise OptionError(f"{name} {value:g} must lie between 0 and 1")
 
 
 EXTRA_OF_PACKAGE = {

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_choice, check_share
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.relations.settings import RelationSettings
@@ -58,10 +58,9 @@ def relations(
     from a point or a thing, without gravity. Raises `OptionError` for a predicate that does not exist or arguments that
     do not fit, `UnknownIdError` for an id that was never given.
     """
-    if predicate is not None and predicate not in ALL_PREDICATES:
-        raise OptionError(f"predicate {predicate!r} is not known; choose one of: {', '.join(ALL_PREDICATES)}")
-    if not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    if predicate is not None:
+        check_choice("predicate", predicate, ALL_PREDICATES)
+    check_share("min_confidence", min_confidence)
     if predicate in VIEWPOINT and viewpoint is None:
         raise OptionError(f"{predicate} depends on the viewpoint: name one (--from ID, camera, camera:FRAME or x,y,z)")
     if viewpoint is not None and predicate is not None and predicate not in VIEWPOINT:

@@ -71,12 +71,11 @@ def list_instances(
 
     Example: list3r list house.l3r --min-confidence 0.2
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.errors import check_share
     from list3r.memory.records import FIRST_SCRAP, FIRST_UNLISTED
 
     least = min_confidence or 0.0
-    if not 0.0 <= least <= 1.0:
-        raise OptionError(f"--min-confidence {least:g} must lie between 0 and 1")
+    check_share("--min-confidence", least)
     with open_memory(memory, None if at is not None else min_confidence) as scene:
         found = scene.instances(structure=None if structure else False)
         if at is not None:

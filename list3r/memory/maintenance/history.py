@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
 from list3r.memory.records import ChangeEvent, Instance
 from list3r.memory.store.store import Store
 
@@ -20,9 +19,7 @@ def world_at(store: Store, session_id: int) -> list[Instance]:
     those of today, which rest on all that was ever seen of an instance. Raises `OptionError` for a session that there
     is not.
     """
-    sessions = [s.session_id for s in store.sessions.all()]
-    if session_id not in sessions:
-        raise OptionError(f"{store.path} has no session {session_id}; it has {', '.join(map(str, sessions))}")
+    store.sessions.check(session_id)
     owner = {c.chunk_id: c.session_id for c in store.chunks.all()}
     seen: dict[int, set[int]] = {}
     for o in store.observations.all():

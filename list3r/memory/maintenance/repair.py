@@ -27,10 +27,12 @@ from list3r.memory.store.checksums import (
 )
 from list3r.memory.store.file import (
     check_beside,
+    check_numbers,
     check_schema,
     connected,
     fold_in,
     migrate,
+    numbers,
     protect,
     rename_exclusively,
 )
@@ -38,7 +40,7 @@ from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
 from list3r.memory.store.rows.codec import checksum, unpack
 from list3r.memory.store.rows.values import bad_values
-from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
+from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
@@ -209,19 +211,9 @@ def _drop_bad_rows(database: sqlite3.Connection, version: int, lost: _Lost) -> N
 
 
 def _check_ours(path: Path, database: sqlite3.Connection) -> None:
-    """Raises `MemoryFileError` for a file that is whole, but of a later program or a stranger's."""
-    try:
-        application, version = (
-            int(database.execute(f"PRAGMA {n}").fetchone()[0]) for n in ("application_id", "user_version")
-        )
-    except FAILURES:
-        return
-    if application != APPLICATION_ID:
-        raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory")
-    if version > SCHEMA_VERSION:
-        raise MemoryFileError(
-            f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
-        )
+    """Raise `MemoryFileError` for a file that can be read but belongs to another program or a newer version."""
+    with contextlib.suppress(*FAILURES):
+        check_numbers(path, *numbers(database))
 
 
 # ------------------------------------------------------------------------------------------- rows
