@@ -21,8 +21,8 @@ import typer.core
 
 from list3r.cli.answer import print_error, wants_json
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
+from list3r.memory.address_space import BUILD_MB, check_address_space
 from list3r.memory.errors import List3rError, naming_extras
-from list3r.memory.room import BUILD_MB, check_address_space
 
 MODULES: dict[str, tuple[str, ...]] = {
     "build.commands": ("inspect", "build", "demo"),

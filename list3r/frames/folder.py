@@ -27,7 +27,7 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal
-from list3r.frames.later import LazyFrame
+from list3r.frames.deferred import LazyFrame
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.leftovers import not_read
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile

@@ -67,7 +67,7 @@ def nearest(
     if words is None:
         near = _near(store, origin, place, k, max_distance, Filters(**options))
         return Matches(_match(i, distance, "", origin, place) for distance, i in near)
-    from list3r.queries.called import called, names_structure, only_common
+    from list3r.queries.by_words import named_by, names_structure, only_common
 
     options["structure"] = options.get("structure", False) or names_structure(words)
     filters = Filters(**options)
@@ -76,7 +76,7 @@ def nearest(
         near = _near(store, origin, place, k, max_distance, filters)
         return Matches(_match(i, distance, f"named {words}", origin, place) for distance, i in near)
     notes: list[str] = []
-    named = called(store, words, origin, filters, encoder, notes)
+    named = named_by(store, words, origin, filters, encoder, notes)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         best = (Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k])

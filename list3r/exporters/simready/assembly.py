@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from list3r.exporters.components import has_box, read_components
 from list3r.exporters.meshes.instance_mesh import InstanceMesh, instance_mesh
 from list3r.exporters.output import replacing_folder, units
-from list3r.exporters.simready.making import Making, write_props
+from list3r.exporters.simready.processes import Making, write_props
 from list3r.exporters.simready.prop import Prop, PropFacts
 from list3r.exporters.usd.labels import set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind

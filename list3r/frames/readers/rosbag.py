@@ -24,7 +24,7 @@ from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.bag_chunks import bound_rosbags
-from list3r.frames.recordings.bag_mending import MendedFile, mended
+from list3r.frames.recordings.bag_recovery import RecoveredFile, recovered
 from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
 from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
@@ -257,7 +257,7 @@ def _parts(path: Path) -> list[Any]:
     """What `rosbags` opens of a recording: files that lack their end, with one."""
     decompressors = bound_rosbags()
     files = _files(path) if path.is_dir() else [path]
-    parts = [mended(p, decompressors) or p for p in files]
+    parts = [recovered(p, decompressors) or p for p in files]
     return [path] if parts == files and _describes(path / "metadata.yaml") else parts
 
 
@@ -271,7 +271,7 @@ def _cut_off(path: Path) -> list[str]:
     return [
         f"{p.path.name} has no index, its recorder did not end it: {100 * p.end // p.size} % of it are whole and read"
         for p in _parts(path)
-        if isinstance(p, MendedFile)
+        if isinstance(p, RecoveredFile)
     ]
 
 

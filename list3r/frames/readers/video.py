@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
-from list3r.frames.decoding.stamps import list_stamps, open_container, packets, picture_stream
+from list3r.frames.decoding.timestamps import list_timestamps, open_container, packets, picture_stream
 from list3r.frames.folder import centred_camera, fingerprint, reduced_note
 from list3r.frames.layout import Optics
 from list3r.frames.options import SourceOptions
@@ -38,7 +38,7 @@ class VideoSource:
         if options.depth_intrinsics or options.T_color_depth:
             raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
         self._path, self._options, self._by_user = path, options, by_user
-        self._stamps = list_stamps(path)
+        self._stamps = list_timestamps(path)
         self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
         count = len(self._stamps)
         times_s = self._stamps.times_s(0, count) if self._stamps.clock else np.arange(count) / self._fps

@@ -15,7 +15,7 @@ import numpy as np
 from list3r.memory.geometry import Array
 from list3r.memory.library.rules import settings_of
 from list3r.memory.maintenance.history import world_at
-from list3r.memory.maintenance.shown import put_before, store_shown
+from list3r.memory.maintenance.temporary_views import put_before, store_shown
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations import predicates
 from list3r.memory.relations.instance_geometry import InstanceGeometry

@@ -17,7 +17,7 @@ _LEAST, _TIMES = 4, 2.0
 _MOST_THINGS = 1500
 
 
-def doubt_of_up(things: Sequence[NDArray[np.float32]], up: str) -> tuple[str, ...]:
+def up_axis_notes(things: Sequence[NDArray[np.float32]], up: str) -> tuple[str, ...]:
     """Return what to say where things, by their points (N, 3) each, plainly stand along another axis than `up`."""
     if len(things) > _MOST_THINGS:
         return ()

@@ -20,7 +20,7 @@ _NAMED = 100_000
 """Most instances that have one word."""
 
 
-def called(
+def named_by(
     store: Store,
     words: str,
     origin: Instance | None,
@@ -33,7 +33,7 @@ def called(
         found, search = meant(store, parse(words), encoder=encoder)
         notes += search.notes
         return [(c.instance, c.score, "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
-    others = [i for i in _bearers(store, words, filters, notes) if origin is None or i.id != origin.id]
+    others = [i for i in _with_words(store, words, filters, notes) if origin is None or i.id != origin.id]
     named = _named(others, words)
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
@@ -57,7 +57,7 @@ def only_common(store: Store, words: str) -> bool:
     return len(store.words.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
 
 
-def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
+def _with_words(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
     """Return what passes the filters: all; of a large memory those that have the most of the words."""
     if not is_large(store):
         return filters.select(store.instances.all())
