@@ -53,7 +53,7 @@ def loops_by_score(store: Store, chunk_id: int, joint: Any, settings: PaperRevis
             reason = f"frames and instances are not alike enough (s_loop {scored.score:.2f})"
             edge = chunks.refused(scored, reason)
         elif tried >= settings.verify or sum(e.accepted for e in edges) >= settings.enough:
-            edge = chunks.refused(scored, "not tried: enough better candidates of this chunk were")
+            edge = chunks.refused(scored, "not tried: enough better candidates of this chunk were tried")
         else:
             edge = joint_edge(joint, *chunks.ends(c), None, settings.window)
             tried += 1

@@ -200,7 +200,9 @@ class _Failures:
         """Memory that ran out, which libraries that are loaded tell in their own way; exit status 1."""
         if isinstance(error, ImportError) and "failed to map" not in str(error):
             raise error
-        message = "the memory that this process may use ran out; raise the limit (ulimit -v, or that of the container)"
+        message = (
+            "the process ran out of the memory that it may use; raise the limit (ulimit -v, or that of the container)"
+        )
         self.fail("MemoryError", message)
         return 1
 

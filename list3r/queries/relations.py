@@ -154,7 +154,7 @@ def _stored(store: Store, subjects: list[int] | None, predicate: str | None, obj
         if (allowed[0] is None or r.subject in allowed[0]) and (allowed[1] is None or r.object in allowed[1])
     ]
     if store.facts.gravity not in ("known", "estimated"):
-        why = "gravity is unknown in this memory, and with it what is on, in, above or under what"
+        why = "gravity is unknown in this memory, so on, in, above and under are unknown too"
         if predicate in VERTICAL and not found:
             return Relations([], "unknown", why)
         if predicate is None:
@@ -170,7 +170,7 @@ def _viewed(
         return Relations(
             [],
             "unknown",
-            "gravity is unknown in this memory, and with it left and right; use a camera as the viewpoint",
+            "gravity is unknown in this memory, so left and right are unknown too; use a camera as the viewpoint",
         )
     things = {i.id: i for i in store.instances.all()}
     if subjects is None and objects is None:

@@ -138,7 +138,7 @@ def _by_frames(
         if any(e.u == u for e in accepted) and not search.wants_another(u, accepted):
             edge = search.refused(scored, "not tried: a better candidate joins the two chunks")
         elif tried >= chosen.verify or len(accepted) >= chosen.enough:
-            edge = search.refused(scored, "not tried: enough better candidates of this chunk were")
+            edge = search.refused(scored, "not tried: enough better candidates of this chunk were tried")
         else:
             edge = search.verified(scored, joint, accepted)
             tried += 1
@@ -330,7 +330,7 @@ class RevisitSearch:
         """Return an edge, rejected if it disagrees with the place that the whole of both chunks supports."""
         if not edge.accepted or not found or self._agree(found[0], edge):
             return edge
-        return _rejected(edge, "the whole of both chunks says otherwise")
+        return _rejected(edge, "the whole of both chunks contradicts it")
 
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
         """Return the edges, with those rejected that join separate components in contradictory ways.
@@ -348,7 +348,7 @@ class RevisitSearch:
         unsure = len(agree[best]) < self._settings.most_ambiguous * len(others)
         out = list(edges)
         for k in across if others and unsure else others:
-            why = "it fits several places as well" if unsure else "more relations say otherwise"
+            why = "other places fit as well" if unsure else "more relations contradict it"
             out[k] = _rejected(edges[k], why)
         return out
 

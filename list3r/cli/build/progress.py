@@ -107,7 +107,7 @@ def build_interrupted(memory: Path, resumed: bool) -> Callable[[bool], str]:
 
     def said(begun: bool) -> str:
         if (begun or resumed) and memory.exists():
-            return f"interrupted; {memory} keeps the finished chunks: go on with the same command and --resume"
+            return f"interrupted; {memory} keeps the finished chunks: continue with the same command and --resume"
         return "interrupted before a chunk was finished; nothing was changed"
 
     return said

@@ -38,7 +38,7 @@ class VideoTimestamps:
     """Stamp of every picture in the order they are shown, ascending, in `unit` seconds; 0, 0, ... without a clock.
     Shape (F,)."""
     keys: NDArray[np.int64]
-    """Time stamps of the key frames that decoding can begin at, ascending; empty if pictures are counted. Shape (K,)."""
+    """Time stamps of the key frames where decoding can begin, ascending; empty if pictures are counted. Shape (K,)."""
     unit: Fraction
     rate: float
     """Mean frame rate that the file states."""

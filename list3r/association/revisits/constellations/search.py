@@ -241,7 +241,7 @@ class ThingSearch:
             inliers=int(found.scores["pairs"]),
             residual_m=found.fit.residual * new.constellation.unit,
             accepted=against is None,
-            reason=f"{agree}; {against}" if against else f"{agree}, and surfaces with them",
+            reason=f"{agree}; {against}" if against else f"{agree}, and so do the surfaces",
             scores={f"things_{name}": value for name, value in found.scores.items()}
             | {_BELIEF: log_odds(found.scores, self._settings.registration.belief)},
             frames=(self._middle_keyframe(u), self._middle_keyframe(self._id)),

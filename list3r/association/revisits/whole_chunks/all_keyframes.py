@@ -52,7 +52,7 @@ class AllKeyframesSettings:
     """By which another place must agree less."""
     kept: int = 6
     """Most relations of the place that is believed."""
-    witness: ChunkAgreementSettings = field(default_factory=ChunkAgreementSettings)
+    whole: ChunkAgreementSettings = field(default_factory=ChunkAgreementSettings)
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class _Place:
     """Relations that put a chunk at one place, the best one first, and what the whole of the chunks says of that."""
 
     edges: list[Edge]
-    witness: ChunkAgreement
+    whole: ChunkAgreement
 
 
 def place_by_all_keyframes(
@@ -79,17 +79,17 @@ def place_by_all_keyframes(
     measured = [e for e in edges if e.S_v_u.translation.any()]
     if not any(e.accepted for e in measured):
         return []
-    views = ChunkKeyframes(old, s.witness), ChunkKeyframes(new, s.witness)
+    views = ChunkKeyframes(old, s.whole), ChunkKeyframes(new, s.whole)
     centers = np.array([k.T_chunk_cam[:3, 3] for k in old])
     places = [_asked(group, *views) for group in _by_place(measured, centers, s)]
-    likely = sorted((p for p in places if p.witness.seen >= s.least_seen), key=lambda p: -p.witness.agreement)
+    likely = sorted((p for p in places if p.whole.seen >= s.least_seen), key=lambda p: -p.whole.agreement)
     if not likely:
         return []
-    best = likely[0].witness.agreement
-    unsure = len(likely) > 1 and likely[1].witness.agreement > best - s.margin
+    best = likely[0].whole.agreement
+    unsure = len(likely) > 1 and likely[1].whole.agreement > best - s.margin
     if best < s.least_agreement or unsure:
         return []
-    return [_witnessed(e, likely[0].witness) for e in likely[0].edges if e.accepted][: s.kept]
+    return [_witnessed(e, likely[0].whole) for e in likely[0].edges if e.accepted][: s.kept]
 
 
 def contradicted(
@@ -99,7 +99,7 @@ def contradicted(
     s = settings or AllKeyframesSettings()
     if edge.frames is None:
         return False
-    views = ChunkKeyframes(old, s.witness), ChunkKeyframes(new, s.witness)
+    views = ChunkKeyframes(old, s.whole), ChunkKeyframes(new, s.whole)
     found = chunk_agreement(edge.S_v_u.as_matrix(), *views, edge.frames)
     return found.seen >= s.least_seen and found.agreement < s.contradicted
 
