@@ -314,7 +314,7 @@ class Catalog:
         by_name = self._by_name(known, (t.memory for t, *_ in held))
         found = [_match(t, *by_name[t.memory], notices) for t, *notices in held if t.memory in by_name]
         stale = sorted({m.memory for m in found if m.stale})
-        notices = [f"{n} has changed since it was added; `list3r catalog add` adds the present file" for n in stale]
+        notices = [f"{n} has changed since it was added; `list3r catalog add` adds the current file" for n in stale]
         return CatalogAnswers(found, [*notes, *notices])
 
 

@@ -337,7 +337,7 @@ class PostgresBackend:
 
     def _failed(self, what: str, error: psycopg.Error) -> CatalogError:
         if what == _WRITTEN:
-            what += "; the same again is safe" if _lost(error) else "; nothing was changed"
+            what += "; running the same command again is safe" if _lost(error) else "; nothing was changed"
         return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_first_line(error)}")
 
 

@@ -200,9 +200,7 @@ class _Failures:
         """Memory that ran out, which libraries that are loaded tell in their own way; exit status 1."""
         if isinstance(error, ImportError) and "failed to map" not in str(error):
             raise error
-        message = (
-            "the process ran out of the memory that it may use; raise the limit (ulimit -v, or that of the container)"
-        )
+        message = "the process ran out of memory; raise its limit (ulimit -v, or that of the container)"
         self.fail("MemoryError", message)
         return 1
 

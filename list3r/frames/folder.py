@@ -47,7 +47,7 @@ _POSES_TRIED = 50
 _FILES_TRIED = 12
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
-NOWHERE_SURE = "the sensor is sure of no depth that was looked at; is `confidence` of this recording?"
+NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `confidence` belong to this recording?"
 
 
 NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not taken over"
@@ -76,7 +76,7 @@ class FolderSource:
         fractions = self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0)
         if fractions and self._typical_raw <= _MOST_M:  # larger numbers with fractions are in the layout's unit
             self.optics = optics = replace(optics, depth_scale=1.0)
-            notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale says otherwise")
+            notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale changes that")
         self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side)
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
@@ -256,7 +256,7 @@ class FolderSource:
         times = usual / given
         how = f"{times:.3g} times larger" if times > 1 else f"{1 / times:.3g} times smaller"
         kind = self._layout.kind
-        return (f"--depth-scale {given:g} makes all {how}: the {kind} layout has {usual:g} units a metre",)
+        return (f"--depth-scale {given:g} makes depth {how}: the {kind} layout has {usual:g} units a metre",)
 
     def _camera_doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with the camera: a centre far from the middle is that of another size."""
@@ -287,8 +287,8 @@ class FolderSource:
         if _LEAST_M <= typical_m <= _MOST_M:
             return (NOWHERE_SURE,) if self._nowhere_sure() else ()
         if typical_m == 0:
-            return ("the depth that was looked at is unknown everywhere (all 0, or all of the largest value)",)
-        return (f"depth is {typical_m:.3g} m in the middle of its range, hardly indoors: --depth-scale may be wrong",)
+            return ("the sampled depth is unknown everywhere (all 0, or all of the largest value)",)
+        return (f"depth is typically {typical_m:.3g} m, which is unlikely indoors: --depth-scale may be wrong",)
 
     def _nowhere_sure(self) -> bool:
         """Whether no frame that is looked at has depth that the sensor is sure enough of."""
@@ -303,7 +303,7 @@ class FolderSource:
         wrong = sum(self._pose(f) is None for f in some)
         if not wrong:
             return ()
-        return (f"{wrong} of {len(some)} poses looked at are no rigid motion (mirrored, stretched or not finite)",)
+        return (f"{wrong} of {len(some)} poses looked at are not rigid motions (mirrored, stretched or not finite)",)
 
     def _count_doubts(self) -> tuple[str, ...]:
         """Return how many frames lack a pose or a depth image that others have."""
@@ -331,7 +331,10 @@ class FolderSource:
         if rig.color_size != rig.stored_size:
             notes = (*notes, reduced_note(rig))
         if self._bits < 16:
-            notes = (*notes, f"of the 16 bits of the pictures {self._bits} are in use, which count as full brightness")
+            notes = (
+                *notes,
+                f"the pictures use {self._bits} of their 16 bits, which are taken as the full range of brightness",
+            )
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration
         if layout.z_up and turns is None and len(layout.files.that_hold(POSE_FILE | POSE)):
@@ -393,7 +396,7 @@ def centred_camera(focal: float, rig: Rig) -> Camera:
 def reduced_note(rig: Rig) -> str:
     """That frames are smaller than stored, for people."""
     (h, w), (height, width) = rig.stored_size, rig.color_size
-    return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side says otherwise (0: never)"
+    return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side changes that (0: never)"
 
 
 def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOptions) -> str:

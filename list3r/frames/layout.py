@@ -85,7 +85,7 @@ VARIES = 0.003
 
 def varies_note(spread: float, carried: bool) -> str:
     """Return what is by_user of frames whose focal lengths differ by a share."""
-    what = "every frame is carried to one camera" if carried else "one camera serves all of them"
+    what = "all frames are resampled to one camera" if carried else "one camera serves all of them"
     return f"focal lengths of frames differ by {100 * spread:.1f} %: {what}"
 
 

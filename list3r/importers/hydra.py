@@ -47,7 +47,7 @@ def read(path: Path) -> ImportedMap:
         notes.append("the file holds no mesh: objects are boxes")
     others = len(content["nodes"]) - len(nodes)
     if others:
-        notes.append(f"{others} nodes that are no objects (places, rooms, agents) were not read")
+        notes.append(f"{others} nodes that are not objects (places, rooms, agents) were not read")
     return ImportedMap("hydra", things, notes=tuple(notes))
 
 

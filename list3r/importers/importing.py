@@ -104,7 +104,7 @@ def _write(store: Store, source: Path, found: ImportedMap, up: str) -> ImportRep
     ids = {found.things[o.local_id].name: o.instance_id for o in store.observations.all()}
     notes = (*found.notes, *up_axis_notes([t.points for t in found.things], up))
     if len(names) < len(found.things):
-        notes = (*notes, "several things of the map have one name")
+        notes = (*notes, "several things of the map have the same name")
     left = len(found.things) - len(store.observations.all())
     if left:
         notes = (*notes, f"{left} things of the map became no instance of their own")

@@ -107,7 +107,7 @@ def list_timestamps(path: Path) -> VideoTimestamps:
         return _listed(path, _WHOLE)[0] if 0 < hidden_s <= _PRIMING_S else found
     except av.FFmpegError as error:
         headless = isinstance(error, av.InvalidDataError)
-        reason = "it is none, or breaks off before its index" if headless else error.strerror
+        reason = "it is not one, or ends before its index" if headless else error.strerror
         raise SourceError(f"{path} is not a video that can be read ({reason}); is the copy complete?") from None
 
 
@@ -195,7 +195,7 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> VideoTimest
         if joined:
             notes = (
                 *notes,
-                "its clock starts again on the way, as in files that were put together; the parts are joined",
+                "its clock starts again in the middle, as in concatenated files; the parts are joined",
             )
         begins = np.zeros(0, np.int64) if counted else keys[once]
         return VideoTimestamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)
@@ -232,12 +232,12 @@ def _other_streams(container: Any) -> tuple[str, ...]:
 def _breaks_off(rows: _Rows, container: Any, stream: Any, unit: Fraction) -> tuple[str, ...]:
     """Return what is said of a file that is shorter than it states."""
     if stream.frames and len(rows) < stream.frames:
-        return (f"the file breaks off: {len(rows)} of its {stream.frames} frames are there",)
+        return (f"the file is cut off: {len(rows)} of its {stream.frames} frames are there",)
     stated = float(container.duration or 0) / float(av.time_base)
     shown = rows[rows[:, 0] != _NONE, 0]
     there = float(int(shown.max() - shown.min()) * unit) if len(shown) else stated
     if there < stated * (1 - _MISSING_SHARE) - 1.0:
-        return (f"the file breaks off: {there:.1f} of its {stated:.1f} seconds are there",)
+        return (f"the file is cut off: {there:.1f} of its {stated:.1f} seconds are there",)
     return ()
 
 

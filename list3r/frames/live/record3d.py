@@ -83,7 +83,7 @@ class Record3dPhone:
                     self._note_once(f"pictures that are not {first.sizes.color[0]}x{first.sizes.color[1]} are left out")
                     continue
                 if again:
-                    self._note_once("the phone's poses after a lost connection are of another world and are left out")
+                    self._note_once("the phone's poses after a lost connection are in another world and are left out")
                 if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > _VARIES:
                     self._note_once("the focal length changes by more than 1 %: one camera serves all pictures")
                 pose = () if again else frame.pose

@@ -62,7 +62,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if others:
         notes.append(f"the model poses {len(posed)} pictures; not read: the models {', '.join(others)} beside it")
     if len(cameras) > 1:
-        notes.append(f"the model has {len(cameras)} cameras; every picture is carried to their median")
+        notes.append(f"the model has {len(cameras)} cameras; all pictures are resampled to their median")
     size = (shared.height, shared.width)
     optics = Optics(intrinsics, shared.distortion, intrinsics_size=size, fisheye=shared.fisheye)
     if options.intrinsics is not None:

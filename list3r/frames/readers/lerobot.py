@@ -63,7 +63,7 @@ class LeRobotSource:
         used = {color} if depth is None else {color, depth}
         notes = [f"episode {episode.number}, {episode.length} frames, of the camera {color}", *merged_notes]
         if depth is not None and self._rig.registration is None:
-            notes.append(f"depth of {depth} is taken to lie on the colour pixels; --depth-to-color says otherwise")
+            notes.append(f"depth of {depth} is assumed to lie on the colour pixels; --depth-to-color changes that")
         if unused := [k for k in features if k not in used and k not in _BOOKKEEPING]:
             notes.append(f"not used: {', '.join(unused)}")
         self._info = self._describe(root, options, episode, tuple(notes))

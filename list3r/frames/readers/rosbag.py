@@ -269,7 +269,7 @@ def _describes(metadata: Path) -> bool:
 def _cut_off(path: Path) -> list[str]:
     """Say what is read of the files that lack their end."""
     return [
-        f"{p.path.name} has no index, its recorder did not end it: {100 * p.end // p.size} % of it are whole and read"
+        f"{p.path.name} has no index, because its recorder was interrupted; {100 * p.end // p.size} % of it is complete and read"
         for p in _parts(path)
         if isinstance(p, RecoveredFile)
     ]
@@ -316,7 +316,7 @@ class _Topics:
         depth_intrinsics, _, depth_size = self._camera(depth)
         T_color_depth = tree.between(color.frame, depth.frame)
         if T_color_depth is not None:
-            notes.append("the place of the depth camera is that of /tf_static")
+            notes.append("the pose of the depth camera is from /tf_static")
         return Optics(intrinsics, lens, depth_intrinsics, T_color_depth, units, size, depth_size), notes
 
     def _camera(self, stream: Stream) -> tuple[Any, tuple[float, ...], tuple[int, int] | None]:

@@ -41,10 +41,10 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
         optics = replace(optics, depth_intrinsics_size=None)
     if optics.T_color_depth is not None and optics.depth_intrinsics is None:
         optics = replace(optics, depth_intrinsics=optics.intrinsics)
-        notes.append("the depth camera is given the colour camera's intrinsics; --depth-intrinsics says otherwise")
+        notes.append("the depth camera is assumed to have the intrinsics of colour; --depth-intrinsics changes that")
     if optics.depth_intrinsics is not None and optics.T_color_depth is None:
         optics = replace(optics, T_color_depth=np.eye(4))
-        notes.append("depth and colour camera are taken to stand in one place; --depth-to-color says otherwise")
+        notes.append("depth and colour camera are assumed to be at the same place; --depth-to-color changes that")
     return optics, tuple(notes)
 
 

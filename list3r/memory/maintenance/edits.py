@@ -96,7 +96,7 @@ def label(store: Store, instance_id: int, text: str | None, author: str | None =
         known = store.ids.resolve(instance_id)
         before = _as_they_are(store, [known])
         edit = replace(_edit("label", (before[0][2],), before, author), text=cleaned)
-        reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} took the label of #{known}"
+        reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} unlabelled #{known}"
         edit = _write_down(store, edit, (f"#{known}", cleaned or ""), reason)
         store.instances.set_labels({known: cleaned})
         return EditReport(edit.entry, "label", (known,), (), (), (), reason)
@@ -148,9 +148,9 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
         touched = sorted({k for _, _, keys in chosen.before for k in keys})
         edit = replace(_edit("undo", (), _owners(store, touched), author), target=entry)
         what = f"the undo of entry {chosen.target}" if chosen.kind == "undo" else f"the {chosen.kind}"
-        reason = f"{edit.author} took back {what} of entry {entry}"
+        reason = f"{edit.author} undid {what} of entry {entry}"
         if chosen.kind == "undo":
-            reason = f"{edit.author} took back the undo of entry {chosen.target}"
+            reason = f"{edit.author} undid the undo of entry {chosen.target}"
         return _carry_out(store, edit, (f"entry {entry}", ""), reason, bring_back=chosen.before)
 
 
@@ -171,7 +171,7 @@ def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
     if one != (d.kind == "merge"):
         raise OptionError(f"entry {entry} no longer applies: {d.a} and {d.b} are {'one' if one else 'two'} now")
     edit = replace(_edit("split" if one else "merge", ((a,), (b,)), before, author), target=entry)
-    reason = f"{edit.author} took back the {d.kind} of entry {entry}"
+    reason = f"{edit.author} undid the {d.kind} of entry {entry}"
     return _carry_out(store, edit, (d.a, d.b), reason)
 
 
