@@ -269,7 +269,7 @@ def _describes(metadata: Path) -> bool:
 def _cut_off(path: Path) -> list[str]:
     """Say what is read of the files that lack their end."""
     return [
-        f"{p.path.name} has no index, because its recorder was interrupted; {100 * p.end // p.size} % of it is complete and read"
+        f"{p.path.name} has no index, because its recorder was interrupted; {100 * p.end // p.size} % of it is read"
         for p in _parts(path)
         if isinstance(p, RecoveredFile)
     ]
