@@ -28,8 +28,8 @@ from list3r.association.graph.edge_information import WeightSettings, informatio
 from list3r.association.graph.growth import extend
 from list3r.association.graph.marginals import marginals
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
-from list3r.association.graph.solver import GraphProblem, stack, take
-from list3r.memory.geometry import Sim3, umeyama
+from list3r.association.graph.solver import GraphProblem
+from list3r.memory.geometry import Sim3, stack, take, umeyama
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]

@@ -54,6 +54,13 @@ class ExportError(List3rError):
     """An export that cannot be written."""
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says, or its kind where it says nothing."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = " ".join(lines[:2]) if lines and lines[0].endswith(":") else (lines[0] if lines else type(error).__name__)
+    return text[:240]
+
+
 def check_choice(name: str, value: str, known: Collection[str]) -> None:
     """Raise `OptionError` for a value that is none of the known ones."""
     if value not in known:

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError, check_choice
+from list3r.memory.errors import OptionError, check_choice, first_line
 from list3r.models.cache import CONFIG, check_weights
 from list3r.models.device import out_of_memory_reported
-from list3r.models.upstream import first_line
 
 if TYPE_CHECKING:
     import torch

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.graph.solver import adjoint, stack
-from list3r.memory.geometry import skew
+from list3r.association.graph.solver import adjoint
+from list3r.memory.geometry import skew, stack
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]

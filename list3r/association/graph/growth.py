@@ -28,9 +28,9 @@ from list3r.association.graph.pose_graph import (
     optimize,
     problem_of,
 )
-from list3r.association.graph.solver import adjoint, stack, unstack
+from list3r.association.graph.solver import adjoint, unstack
 from list3r.association.quantiles import chi2_quantile
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]

@@ -27,9 +27,9 @@ from list3r.association.graph.chunk_nodes import (
 from list3r.association.graph.edge_information import information_of
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings
 from list3r.association.graph.sampled_chunks import SampledChunks
-from list3r.association.graph.solver import GraphProblem, stack, take, unstack
+from list3r.association.graph.solver import GraphProblem, unstack
 from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack, take
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]

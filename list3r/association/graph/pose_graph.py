@@ -19,9 +19,9 @@ from scipy.cluster.hierarchy import DisjointSet
 from list3r.association.graph.edge_information import WeightSettings, information_of, own_shapes
 from list3r.association.graph.loop_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
 from list3r.association.graph.marginals import widening
-from list3r.association.graph.solver import GraphProblem, adjoint, stack, take, unstack
+from list3r.association.graph.solver import GraphProblem, adjoint, unstack
 from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack, take
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]

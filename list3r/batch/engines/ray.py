@@ -8,6 +8,7 @@ from typing import Any
 
 from list3r.batch.engines.base import TaskResources
 from list3r.batch.work import BatchJob, Outcome, run_task
+from list3r.memory.errors import first_line
 from list3r.pipeline.workers.cluster import RayCluster
 
 _GIB = 2**30
@@ -43,7 +44,7 @@ class RayEngine:
             try:
                 outcome = self._cluster.result(done)
             except self._cluster.errors.RayError as error:
-                reason = next((line for line in str(error).splitlines() if line.strip()), "")
+                reason = first_line(error)
                 outcome = Outcome(job.task, "lost", f"{type(error).__name__}: {reason}".rstrip(": "))
             yield outcome
 

@@ -28,7 +28,7 @@ from list3r.frames.recordings.aria_trajectory import DeviceTrajectory, read_traj
 from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.registration.rig import WORKING_SIDES
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
 
 COLOR, DEPTH = "214-1", "345-1"
 """Streams of the colour camera and, in a file of its own, of the Digital Twin's depth on its pixels."""
@@ -182,7 +182,7 @@ def _opened(path: Path, stream: str) -> Any:
         with _quiet():
             provider = create_vrs_data_provider(str(path))
     except RuntimeError as error:
-        raise SourceError(f"{path} cannot be read ({str(error).splitlines()[0]}); copy it again") from None
+        raise SourceError(f"{path} cannot be read ({first_line(error)}); copy it again") from None
     if provider is None:
         raise SourceError(f"{path} is not a recording in VRS that can be read; is the copy complete?")
     streams = [str(s) for s in provider.get_all_streams()]
@@ -206,7 +206,7 @@ def _picture(provider: Any, stream: str, number: int) -> NDArray[Any]:
         with _quiet():
             image = provider.get_image_data_by_index(StreamId(stream), number)[0]
     except RuntimeError as error:
-        raise FrameError(f"picture {number} of {stream} cannot be decoded ({str(error).splitlines()[0]})") from None
+        raise FrameError(f"picture {number} of {stream} cannot be decoded ({first_line(error)})") from None
     if not image.is_valid():
         raise FrameError(f"picture {number} of {stream} cannot be decoded")
     return np.asarray(image.to_numpy_array())

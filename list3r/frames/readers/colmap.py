@@ -25,7 +25,7 @@ from list3r.frames.layout import (
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.colmap_files import frames_are_whole, written_sizes
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, first_line
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 _FOLDERS = ("images", "rgb", "color", ".")
@@ -94,7 +94,7 @@ def _read(model: Path) -> tuple[Any, dict[str, NDArray[np.float64]]]:
     except IndexError:
         raise SourceError(apart) from None
     except (RuntimeError, ValueError, OSError) as error:
-        reason = str(error).splitlines()[0]
+        reason = first_line(error)
         if "optional" in reason:
             reason = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
         raise SourceError(f"{model} is not a model of COLMAP that can be read ({reason})") from None

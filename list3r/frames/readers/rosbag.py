@@ -29,7 +29,7 @@ from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color,
 from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -247,9 +247,8 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         with AnyReader(_parts(path), default_typestore=known) as reader:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SourceError(
-            f"{path} cannot be read as a ROS recording ({reason}); reindex it, or copy it again"
+            f"{path} cannot be read as a ROS recording ({first_line(error)}); reindex it, or copy it again"
         ) from None
 
 

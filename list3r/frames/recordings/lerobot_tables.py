@@ -11,7 +11,7 @@ import numpy as np
 
 from list3r.frames.files import MAX_TEXT_BYTES, check_ordinary
 from list3r.frames.layout import inside, read_json
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, first_line
 
 INFO = "meta/info.json"
 _VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -94,8 +94,7 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
                 _check_count(path, file.metadata.num_rows + len(found))
                 rows = file.read(columns=columns, use_threads=False).to_pylist()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise SourceError(f"{path} is not a table that can be read ({reason[:160]}); copy it again") from None
+            raise SourceError(f"{path} is not a table that can be read ({first_line(error)}); copy it again") from None
         found |= {int(row["episode_index"]): row for row in (_sound(path, row, columns) for row in rows)}
     if not found:
         raise SourceError(f"{root} has no episodes in meta/episodes; is the copy complete?")
