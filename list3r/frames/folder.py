@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import (
     clean_depth,
     fault_of,
@@ -53,7 +53,7 @@ NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `conf
 NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not taken over"
 
 
-class FolderSource:
+class FolderSource(Reader):
     """A `FrameSource` over files; nothing is kept between frames."""
 
     def __init__(self, root: Path, layout: FolderLayout, options: SourceOptions) -> None:
@@ -82,15 +82,6 @@ class FolderSource:
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
         self._info = self._describe(root, (*notes, *self._doubts()))
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""

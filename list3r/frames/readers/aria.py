@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
@@ -52,7 +52,7 @@ def _video(root: Path) -> Path | None:
     return (usual or found)[0] if usual or len(found) == 1 else None
 
 
-class AriaSource:
+class AriaSource(Reader):
     """A `FrameSource` over one recording; nothing but its clock and its poses is kept."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:
@@ -85,15 +85,6 @@ class AriaSource:
         self._poses = [None if T is None else T @ self._view.T_cam_upright for T in placed] or [None] * len(pairs)
         notes += [] if table is None or moved is None else _pose_notes(table, moved, self._poses)
         self._info = self._describe(root, tuple(notes), moved)
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -36,7 +36,7 @@ def is_dataset(root: Path) -> bool:
     return (root / INFO).is_file() and ((root / "data").is_dir() or (root / "videos").is_dir())
 
 
-class LeRobotSource:
+class LeRobotSource(Reader):
     """A `FrameSource`: the pictures of one camera in one episode, numbered from 0, with depth where a key has it."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:
@@ -67,15 +67,6 @@ class LeRobotSource:
         if unused := [k for k in features if k not in used and k not in _BOOKKEEPING]:
             notes.append(f"not used: {', '.join(unused)}")
         self._info = self._describe(root, options, episode, tuple(notes))
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Listing, Reader, SourceInfo, missing_parts
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
 from list3r.frames.layout import FolderLayout, Optics
@@ -88,7 +88,7 @@ class Stream:
     """The first message."""
 
 
-class BagSource:
+class BagSource(Reader):
     """A `FrameSource` over one recording; nothing but its index is kept."""
 
     def __init__(self, path: Path, options: SourceOptions, listing: Listing | None = None) -> None:
@@ -132,15 +132,6 @@ class BagSource:
         elif tree.moving:
             notes.append(f"poses of {', '.join(sorted(tree.moving))}; no transform leads from there to {color.frame}")
         self._info = replace(self._describe(tuple(notes), posed > 0), poses_drift=world == DRIFTING)
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
 from list3r.frames.decoding.timestamps import list_timestamps, open_container, packets, picture_stream
@@ -27,7 +27,7 @@ _EARLIER = 4
 """Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
 
-class VideoSource:
+class VideoSource(Reader):
     """A `FrameSource` over one video stream. Every `read` opens the file again and seeks to its first frame."""
 
     def __init__(self, path: Path, options: SourceOptions, *, by_user: bool = True) -> None:
@@ -45,15 +45,6 @@ class VideoSource:
         self._chosen = select(times_s, options, path, clock=self._stamps.clock, video=True)
         self._upright, self._rig = self._first()
         self._info = self._describe()
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""

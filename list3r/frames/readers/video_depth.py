@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
 from list3r.frames.layout import Optics
@@ -48,7 +48,7 @@ class RecordingParts:
     """Frames' own cameras, of the pictures as stored, where they differ from `intrinsics`."""
 
 
-class VideoWithDepth:
+class VideoWithDepth(Reader):
     """A `FrameSource`: the pictures of the video, each with depth and pose of its number."""
 
     def __init__(self, root: Path, parts: RecordingParts, options: SourceOptions) -> None:
@@ -66,15 +66,6 @@ class VideoWithDepth:
         size = read_raw_depth(next(iter(parts.depth.values()))).shape if parts.depth else None
         self._rig = build_rig(optics, stored, (size[0], size[1]) if size else None, options.max_depth_m, side)
         self._info = self._describe(root)
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""
