@@ -29,13 +29,13 @@ from list3r.frames.decoding.decode import (
 from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.deferred import LazyFrame
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
-from list3r.frames.leftovers import not_read
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
+from list3r.frames.unread import not_read
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0

@@ -15,12 +15,12 @@ from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, miss
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
 from list3r.frames.layout import Optics
-from list3r.frames.leftovers import not_read
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
+from list3r.frames.unread import not_read
 from list3r.memory.errors import FrameError
 
 _FRAMES_TRIED = 12
