@@ -17,7 +17,7 @@ chunks, descriptors and joint windows, and chunks end at cuts in all of them but
 
 - vggt-long: as published, `benchmarks/peers/vggt_long.py`, which detects no cuts;
 - vggt-long-cuts: the same on chunks that end at cuts;
-- ilrd-paper: loops accepted by s_loop alone, as the paper writes it;
+- ilrd-paper: loops accepted by s_loop alone, as the paper writes it, `benchmarks/peers/paper_loops.py`;
 - verified: loops proposed by frame similarity and verified by geometry, no instance anywhere;
 - ilrd: + instances rank candidates and object to relations;
 - iasm-paper: instance-aware merging as the paper writes it, `benchmarks/peers/paper_support.py`: instances whose
@@ -179,17 +179,19 @@ def run_video(job: tuple[str, int, Sequence[str], str]) -> list[dict[str, Any]]:
 
 def variant_settings(variant: str) -> Any:
     """Return the product's settings with the parts that a variant lacks switched off."""
+    from benchmarks.peers.graph_weights import PaperWeightSettings, PlainWeightSettings
+    from benchmarks.peers.paper_loops import PaperRevisitSettings
     from benchmarks.peers.paper_support import PaperSupportSettings
     from list3r.pipeline.settings import AssociationSettings
 
     full = AssociationSettings()
     plain_edges = replace(full.edges, instance_aware=False)
-    plain_graph = replace(full.graph, weighted=False, robust=False)
-    paper_weights = replace(full.graph, robust=False, weights=replace(full.graph.weights, sharpen=True))
+    plain_graph = replace(full.graph, weights=PlainWeightSettings(), robust=False)
+    paper_weights = replace(full.graph, weights=PaperWeightSettings(), robust=False)
     blind = variant in ("verified", "full-no-instances")
     loops = _without_instances(full.revisits) if blind else full.revisits
     if variant == "ilrd-paper":
-        loops = replace(loops, verified=False)
+        loops = PaperRevisitSettings()
     graph = {"cwgo-paper": paper_weights}.get(variant, plain_graph)
     edges = full.edges if variant in ("iasm", "cwgo-paper", "graph", "full") else plain_edges
     if variant == "iasm-paper":
@@ -216,6 +218,8 @@ def _without_instances(revisits: Any) -> Any:
 
 def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, truth: _Truth) -> dict[str, Any]:
     """Build a memory of the chunks (placed only) and measure it."""
+    from benchmarks.peers.graph_weights import peer_weights
+    from benchmarks.peers.paper_loops import paper_loops
     from benchmarks.peers.paper_support import paper_merging
     from list3r.association.overlap.motion import flag_moving
     from list3r.frames.base import Camera
@@ -238,10 +242,11 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, tr
                 height, width = result.image_size
                 camera = Camera(width, height, *result.intrinsics)
                 chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
-            with paper_merging():
+            with paper_merging(), paper_loops(), peer_weights():
                 add_chunk(store, session, chunk, joint, settings, library=False)
         if not peer:
-            finish_session(store, session, settings, library=False)
+            with peer_weights():
+                finish_session(store, session, settings, library=False)
         return truth.measure(store)
 
 

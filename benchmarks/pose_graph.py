@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
+from benchmarks.peers.graph_weights import PlainWeightSettings, peer_weights
+from list3r.association.graph.edge_information import WeightSettings, information_of
 from list3r.association.graph.growth import extend
 from list3r.association.graph.marginals import marginals
-from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of, optimize
-from list3r.association.graph.solver import GraphProblem, stack, take
-from list3r.memory.geometry import Sim3, umeyama
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
+from list3r.association.graph.solver import GraphProblem
+from list3r.memory.geometry import Sim3, stack, take, umeyama
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
@@ -296,6 +298,8 @@ def false_loops(chunks: int, edges: int, seed: int, alike: bool, drift: float = 
         return ate(stack([result.S_graph_chunk[k] for k in ids]), clean.truth)
 
     without, (with_false, seconds) = placed(solved(clean)), timed(lambda: solved(spoilt), 1)
+    with peer_weights():
+        plain = solved(spoilt, GraphSettings(weights=PlainWeightSettings(), robust=False))
     believed = np.array([e.accepted for e in with_false.edges])
     start = chained(spoilt.edges, first[0])
     row = {
@@ -305,12 +309,12 @@ def false_loops(chunks: int, edges: int, seed: int, alike: bool, drift: float = 
         "ate": without,
         "ate_with_false": placed(with_false),
         "ratio": placed(with_false) / without,
-        "ate_plain": placed(solved(spoilt, GraphSettings(weighted=False, robust=False))),
+        "ate_plain": placed(plain),
         "seconds": seconds,
         "false_kept": int((believed & spoilt.false).sum()),
         "true_lost": int((~believed & ~spoilt.false).sum()),
     }
-    ours = information_of(spoilt.edges, False, GraphSettings())
+    ours = information_of(spoilt.edges, False, WeightSettings())
     for name, weights in (("gnc", None), ("gnc_our_weights", ours)):
         (poses, kept), row[f"seconds_gtsam_{name}"] = timed(lambda weights=weights: gnc(spoilt, start, weights), 1)
         row[f"ate_gtsam_{name}"] = ate(poses, clean.truth)

@@ -63,7 +63,8 @@ def measure(
     name: str, results: Sequence[ChunkResult], truth: Trajectory, path: Path, seed: int | None
 ) -> dict[str, Any]:
     """Associate the chunks, in gauges drawn from the seed, and compare the trajectory with the truth."""
-    from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
+    from list3r.association.revisits.joint_source import JointSourceReconstructor
+    from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
     rng = None if seed is None else np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "memory.l3r") as store:
@@ -71,7 +72,8 @@ def measure(
             store.facts.scale_kind = "metric" if rng is None else "relative"
             store.facts.poses = "estimate"
             session = store.sessions.add(str(path), "", {}, len(truth.time_s))
-        joint = RgbdJointReconstructor({s.session_id: s.source for s in store.sessions.all()})
+        sources = {s.session_id: s.source for s in store.sessions.all()}
+        joint = JointSourceReconstructor(sources, {}, RgbdReconstructor(poses="estimate"))
         for result in results:
             if rng is None:
                 add_chunk(store, session, result, library=False)

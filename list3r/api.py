@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Un
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import List3rError, OptionError, naming_extras
+from list3r.memory.errors import List3rError, OptionError, check_share, naming_extras
 from list3r.memory.maintenance.editing import MemoryEdits
 from list3r.memory.store.store import Store
 
@@ -68,14 +68,14 @@ def open(
     Many can read while one writes; a second writer is refused. With `at` every question is about the world as it was
     after that session, and nothing can be written. Raises `OptionError` for an unknown session.
 
-    With `min_confidence` every question is about all instances with at least that confidence, also scraps, which are
-    not listed otherwise. Nothing can be written then, and with `at` there are no scraps.
+    With `min_confidence` every question is about all instances with at least that confidence, including scraps, which
+    are otherwise not listed. Nothing can be written then, and with `at` there are no scraps.
 
     >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
     >>> list3r.open("house.l3r", min_confidence=0.2).instances()
     """
-    if min_confidence is not None and not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    if min_confidence is not None:
+        check_share("min_confidence", min_confidence)
     if at is None and min_confidence is None:
         return SceneMemory(Store.open(path, writable=writable))
     if writable:
@@ -109,7 +109,7 @@ def build(
     continues a build that was interrupted; `force` replaces an existing memory. `licence` names the
     licences that networks may have: permissive (any use, no account), research (also non-commercial, gated and custom
     ones) or any. `scale_anchor` is a known length, `detector` (with `detector_classes`) the file of a box detector.
-    Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`, each with the way to mend it.
+    Raises `SourceError`, `OptionError`, `MemoryFileError` or `TrackingError`; the message says how to fix it.
 
         >>> list3r.build("walk/", "house.l3r", settings=list3r.BuildRequest(preset="light"), workers=2)
     """
@@ -132,7 +132,7 @@ def update(
 
     The arguments are those of `build`; `force` gives up an update that was interrupted. A video in which no stored
     place is recognised becomes a connected component of its own. Raises `SourceError`, `OptionError`,
-    `TrackingError` or `MemoryFileError`, each with the way to mend it.
+    `TrackingError` or `MemoryFileError`; the message says how to fix it.
     """
     from list3r.pipeline import update as updating
     from list3r.pipeline.request import RunOptions
@@ -156,10 +156,10 @@ class SceneMemory(MemoryEdits):
         from list3r.queries.info import describe_counts
 
         try:
-            told = f"{self.path.name!r}: {describe_counts(self.store)}"
+            text = f"{self.path.name!r}: {describe_counts(self.store)}"
         except (List3rError, sqlite3.Error):
-            told = f"{self.path.name!r}, closed"
-        return f"<SceneMemory {told}>"
+            text = f"{self.path.name!r}, closed"
+        return f"<SceneMemory {text}>"
 
     def __len__(self) -> int:
         return len(self.instances())
@@ -357,7 +357,7 @@ class SceneMemory(MemoryEdits):
 
     @_alone
     def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
-        """Return when and in which frames an instance was seen. Breaks of at most `gap_s` do not end a stretch."""
+        """Return when and in which frames an instance was seen. Gaps up to `gap_s` seconds do not end an interval."""
         from list3r.queries.seen import seen
 
         return seen(self.store, instance_id, gap_s=gap_s)
@@ -371,7 +371,7 @@ class SceneMemory(MemoryEdits):
         max_depth: float | None = None,
         **filters: Unpack[FilterOptions],
     ) -> list[Match]:
-        """Return what a camera sees: things of which other things leave at least a share of `min_visible` unhidden.
+        """Return what a camera sees: things of which at least a share of `min_visible` is not hidden by others.
 
         >>> memory.visible(memory.camera(time_s=12.5))
         """
@@ -497,10 +497,10 @@ class SceneMemory(MemoryEdits):
         return keyframe_rgb(self.store, picture)
 
     def prompt(self, tokens: int = 2000, question: str | None = None) -> ScenePrompt:
-        """Return the memory as text for a language model, of at most so many tokens; `str` of it is the text.
+        """Return the memory as text for a language model, of at most `tokens` tokens; `str` of it is the text.
 
         With a `question` the things that its words name come first, then the things nearest to them. Tokens are counted
-        by `list3r.exporters.prompt.tokens.count_tokens`. Raises `OptionError` if they do not suffice for the head.
+        by `list3r.exporters.prompt.tokens.count_tokens`. Raises `OptionError` if they are too few for the heading.
 
         >>> print(memory.prompt(1000, "what is on the table?"))
         """

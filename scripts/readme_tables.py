@@ -537,7 +537,7 @@ PAGES = (
 
 
 def filled(text: str) -> str:
-    """Return a page with every marked table written anew. Raises `SystemExit` for a mark without a table."""
+    """Return a page with every marked table written again. Raises `SystemExit` for a mark without a table."""
 
     def fill(mark: re.Match[str]) -> str:
         name = mark.group(1)

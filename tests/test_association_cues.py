@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.revisits.chain import ChainSettings, Ways
+from list3r.association.revisits.chain import ChainSettings, EdgeChains
 from list3r.association.revisits.cross_check import Side, cross_check, shared_view
 from list3r.association.revisits.cues import CueSettings, InstanceSet, compare_instances, instance_set, loop_score
 from list3r.association.revisits.joint_window import Place, composed_covariance, joint_edge
@@ -181,14 +181,14 @@ def test_the_way_predicts_a_relation_and_refuses_what_lies_far_from_it() -> None
     gauges = [Sim3.exp(rng.normal(size=7) * 0.5) for _ in range(5)]
     edges = [edge_between(k, k + 1, gauges[k + 1].inverse() @ gauges[k]) for k in range(4)]
     edges[2] = edge_between(3, 2, gauges[2].inverse() @ gauges[3])
-    way = Ways(edges, ChainSettings()).predict(0, 4)
+    way = EdgeChains(edges, ChainSettings()).predict(0, 4)
     assert way is not None
     true = gauges[4].inverse() @ gauges[0]
     assert way.deviations(true) < 1e-6
     assert way.deviations(true @ Sim3.exp([0.1, 0, 0, 0, 0, 0, 0])) < ChainSettings().most_deviations
     assert way.deviations(true @ Sim3.exp([6.0, 0, 0, 0, 0, 0, 0])) > ChainSettings().most_deviations
-    assert Ways(edges[:2], ChainSettings()).predict(0, 4) is None
-    assert Ways([replace(e, accepted=False) for e in edges], ChainSettings()).predict(0, 4) is None
+    assert EdgeChains(edges[:2], ChainSettings()).predict(0, 4) is None
+    assert EdgeChains([replace(e, accepted=False) for e in edges], ChainSettings()).predict(0, 4) is None
 
 
 def test_covariances_compose_as_errors_do() -> None:
@@ -209,7 +209,7 @@ def test_the_uncertainty_of_a_way_is_that_of_its_errors() -> None:
     rng = np.random.default_rng(2)
     steps = [Sim3.exp(0.5 * rng.normal(size=7)) for _ in range(2)]
     edges = [edge_between(0, 1, steps[0], 1e-3), edge_between(2, 1, steps[1], 1e-3)]
-    way = Ways(edges, ChainSettings(shift=0.0, turn_deg=0.0, log_scale=0.0)).predict(0, 2)
+    way = EdgeChains(edges, ChainSettings(shift=0.0, turn_deg=0.0, log_scale=0.0)).predict(0, 2)
     assert way is not None
     errors = []
     for _ in range(3000):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.graph.edge_information import WeightSettings, edge_weights
 from list3r.association.graph.pose_graph import optimize
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
@@ -122,12 +121,6 @@ def test_loops_alone_can_join_what_chains_do_not() -> None:
     result = optimize(range(4), edges, {}, metric=True)
     assert set(result.components.values()) == {0}
     assert errors(result.S_graph_chunk, truth).max() < 1e-6
-
-
-def test_weights_keep_the_papers_ratios_with_the_strongest_at_one() -> None:
-    weights = edge_weights(np.array([1.0, 0.25]), WeightSettings())
-    assert weights[0] == 1.0
-    assert 1.0 / weights[1] == pytest.approx(2300, rel=0.05)
 
 
 def test_a_thousand_chunks() -> None:

@@ -6,15 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.peers.graph_weights import PaperWeightSettings, edge_weights
+from benchmarks.peers.paper_loops import PaperRevisitSettings
 from benchmarks.peers.point_maps import coverage_rank
-from list3r.association.graph.edge_information import WeightSettings, edge_weights
 from list3r.association.graph.pose_graph import chain_poses
 from list3r.association.overlap.alignment import AlignmentSettings, align
 from list3r.association.overlap.inconsistency import displacement, inconsistency
 from list3r.association.overlap.regions import EdgeSupportSettings, Regions, confident
 from list3r.association.overlap.shared_points import Pairs
 from list3r.association.revisits.cues import InstanceCues, InstanceSet, compare_instances, loop_score
-from list3r.association.revisits.search import RevisitSettings
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
@@ -22,7 +22,7 @@ from list3r.memory.records import Edge
 
 def test_s_loop_weighs_frames_against_instances() -> None:
     cues = InstanceCues(s_sem=0.9, s_rel=0.6, pairs=((1, 1),), log_scale=0.0)
-    settings = RevisitSettings()
+    settings = PaperRevisitSettings()
     assert (settings.lambda_, settings.least_score) == (0.5, 0.7)
     assert loop_score(0.8, cues, settings.lambda_) == pytest.approx(1.15)  # 0.5 * 0.8 + 0.5 * (0.9 + 0.6)
     assert loop_score(0.8, cues, 1.0) == pytest.approx(0.8)
@@ -50,7 +50,7 @@ def _set(looks: np.ndarray) -> InstanceSet:
 def test_weights_of_edges_are_the_papers() -> None:
     # m = 1: log(1.3) = 0.262364, u = 0.207836, u^6 = 8.0598e-5, (1 - u)^6 = 0.247110, weight 3.2606e-4
     # m = 0.25: log(1.075) = 0.072321, u = 0.067443, u^6 = 9.4110e-8, (1 - u)^6 = 0.657642, weight 1.4310e-7
-    weights = edge_weights(np.array([1.0, 0.25]), WeightSettings())
+    weights = edge_weights(np.array([1.0, 0.25]), PaperWeightSettings())
     assert weights[0] == 1.0
     assert weights[1] == pytest.approx(1.4310e-7 / 3.2606e-4, rel=1e-3)
     assert 1 / weights[1] == pytest.approx(2278, rel=2e-3)

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from benchmarks.peers.graph_weights import PlainWeightSettings, peer_weights
 from list3r.association.graph.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
 from list3r.association.graph.edge_information import WeightSettings, support_of
 from list3r.association.graph.growth import extend
 from list3r.association.graph.loop_trust import Tree, chain_squares
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
-from list3r.association.graph.solver import GraphProblem, adjoint, stack, take
+from list3r.association.graph.solver import GraphProblem, adjoint
 from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, skew
+from list3r.memory.geometry import Sim3, skew, stack, take
 from list3r.memory.records import Edge
 
 UNIT = np.array([1.5] * 3 + [1.0] * 4)
@@ -231,7 +232,8 @@ def test_a_wrong_adjacent_edge_yields_to_many_loops() -> None:
     assert sum(not e.accepted for e in result.edges) <= 2
     errors = [np.linalg.norm(result.S_graph_chunk[k].translation - truth[k].translation) for k in range(40)]
     assert max(errors) < 0.5
-    plain = solved(truth, edges, GraphSettings(weighted=False, robust=False))
+    with peer_weights():
+        plain = solved(truth, edges, GraphSettings(weights=PlainWeightSettings(), robust=False))
     assert all(e.accepted for e in plain.edges)
 
 

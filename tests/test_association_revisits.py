@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from benchmarks.peers.paper_loops import PaperRevisitSettings, loops_by_score
 from list3r.association.revisits.frame_search import TRAINED, SearchSettings, choose
 from list3r.association.revisits.scaled_verification import verify_scaled
 from list3r.association.revisits.search import RevisitSettings, find_loops
@@ -262,7 +263,7 @@ def test_what_fits_two_places_of_a_part_apart_is_not_believed(here: Keyframe, ag
     twin, elsewhere = replace(here, frame_index=100), keyframes_at(3.0, first=150)
     edges = find_loops(Chunks([(here,), (twin,), elsewhere, (again,)], known=[between]), 3)
     assert {e.u for e in edges} == {0, 1} and not any(e.accepted for e in edges)
-    assert all("fits several places" in e.reason for e in edges)
+    assert all("other places fit as well" in e.reason for e in edges)
     tied = Edge(
         1, 3, S_v_u=Sim3.from_matrix(GAUGE), reason="", scores={"spread": 3.0}, covariance=1e-6 * np.eye(7), **kinds
     )
@@ -287,10 +288,13 @@ def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyf
     noise = np.random.default_rng(0).normal(0, 1, len(again.descriptor))
     mixed = again.descriptor + 3 * noise / np.linalg.norm(noise)
     less = replace(again, descriptor=mixed / np.linalg.norm(mixed), keypoints_xy=again.keypoints_xy[:0])
-    for verified in (False, True):
-        edges = find_loops(Chunks([(here,), (), (less,)]), 2, settings=RevisitSettings(verified=verified))
+    memory = Chunks([(here,), (), (less,)])
+    for edges, refused in (
+        (find_loops(memory, 2), False),
+        (loops_by_score(memory, 2, None, PaperRevisitSettings()), True),
+    ):
         assert len(edges) == 1 and edges[0].scores["s_det"] < 0.85
-        assert ("not alike enough" in edges[0].reason) is not verified
+        assert ("not alike enough" in edges[0].reason) is refused
 
 
 def test_chunks_without_keyframes_or_with_broken_descriptors(here: Keyframe, again: Keyframe) -> None:

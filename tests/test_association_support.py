@@ -87,7 +87,7 @@ def test_a_wrong_frame_is_not_a_mover() -> None:
     assert not found.removed.any()
 
 
-def test_doubted_things_come_in_again_and_every_frame_has_one_say() -> None:
+def test_depth_errorsed_things_come_in_again_and_every_frame_has_one_say() -> None:
     u, v = film(noise=0.003), film(S_chunk_world=S_V, noise=0.003, seed=1)
     doubt = np.where(u.instance == BOX, 0.01, 0.8).astype(np.float32)
     pairs = shared_pairs(replace(u, confidence=doubt), replace(v, confidence=doubt))

@@ -238,7 +238,7 @@ def test_pictures_of_fewer_bits_in_sixteen_are_as_bright_as_they_were(tmp_path: 
     (first,) = (f for f in source.read(0, 1) if isinstance(f, Frame))
     expected = cv2.cvtColor(picture(0), cv2.COLOR_RGB2GRAY)
     np.testing.assert_array_equal(first.color[1:, :, 0], expected[1:])
-    assert any(f"{bits} are in use" in note for note in source.info.notes) == (bits < 16)
+    assert any(f"use {bits} of their 16 bits" in note for note in source.info.notes) == (bits < 16)
 
 
 def test_a_folder_with_a_video_in_it_names_the_video(tmp_path: Path) -> None:

@@ -193,7 +193,7 @@ def test_videos_and_memories_may_lie_on_a_store_of_fsspec(folder: Path, built: t
         ("", "names no video"),
         ("{", "line 1: .* write a path or a JSON object"),
         ('{"memory": "a"}', "line 1: no source"),
-        ('a.mp4\n{"source": "b.mp4", "lens": 2}', "line 2: lens is no option"),
+        ('a.mp4\n{"source": "b.mp4", "lens": 2}', "line 2: lens is not an option"),
         ('{"source": "b.mp4", "intrinsics": "1,2"}', "line 1: .*--intrinsics"),
         ("one/walk.mp4\ntwo/walk.mp4", "second video would go to walk.l3r"),
         ('{"source": "a", "memory": "../a"}', "cannot be the name of a memory"),

@@ -238,7 +238,7 @@ def test_the_index_of_vectors_grows_with_them(vectors: Catalog, server: Postgres
     assert len(set(before) & set(cosine[:20])) >= 19
     with backend.loading(many=False):
         for name in ("m4", "m2"):
-            assert backend.put(held[name], anew=True).revision == 1
+            assert backend.put(held[name], again=True).revision == 1
     assert answer(20) == before
     assert len(answer(900)) == 900  # more than the lists that are looked at first hold
     with backend.loading(many=True):

@@ -179,7 +179,7 @@ MORE_CASES = {
     "how to read which video": ("detect {p}/room.l3r --detector {p}/x.param --every 5", "--source SOURCE"),
     "a manifest cut off": (
         "build {p}/good -m {p}/new.l3r --reconstruction precomputed --weights {p}/cut",
-        "is no JSON",
+        "is not JSON",
     ),
     "a manifest without files": (
         "build {p}/good -m {p}/new.l3r --reconstruction precomputed --weights {p}/pre",

@@ -153,7 +153,7 @@ CASES = {
     "revisits of nothing": ("revisits {p}/absent.npz {p}/walk.l3r", "absent.npz"),
     "revisits of another array": ("revisits {p}/zeros.npz {p}/walk.l3r", "zeros.npz has no array frame"),
     "revisits of another video": ("revisits {p}/other.npz {p}/walk.l3r", "none of its 26 frames is in the memory"),
-    "revisits of another clock": ("revisits {p}/slow.npz {p}/walk.l3r", "is it the source"),
+    "revisits of another clock": ("revisits {p}/slow.npz {p}/walk.l3r", "is it the source of the memory"),
     "revisits of no memory": ("revisits {p}/walk.npz {p}/note.txt", "not a memory"),
     "revisits of no session": ("revisits {p}/walk.npz {p}/walk.l3r --session 9", "no session 9"),
     "revisits of a source without poses": ("revisits {p}/unposed {p}/walk.l3r", "no poses"),

@@ -119,7 +119,7 @@ def test_what_is_wrong_is_one_clear_line(name: str, tmp_path: Path) -> None:
 
 def test_an_episode_is_of_a_data_set(tmp_path: Path) -> None:
     put(tmp_path / "walk/a.jpg", b"x")
-    with pytest.raises(OptionError, match="--episode is of data sets of LeRobot"):
+    with pytest.raises(OptionError, match="--episode is for LeRobot data sets"):
         open_source(tmp_path / "walk", SourceOptions(episode=1))
     with pytest.raises(SourceError, match="codebase_version"):
         put(tmp_path / "set/meta/info.json", "{}")

@@ -105,7 +105,7 @@ def test_confidence_in_either_code_says_the_same(write: Callable[[Path], Path], 
     assert (depth[:, : third - 4] == 0).all() and (depth[:, third + 4 :] > 0).mean() > 0.9
     for file in files:
         put(file, png(np.zeros((DEPTH_HEIGHT, DEPTH_WIDTH), np.uint8)))
-    assert any("sure of no depth" in note for note in open_source(path).info.notes)
+    assert any("not sure of any depth" in note for note in open_source(path).info.notes)
 
 
 def test_half_sure_in_either_code_is_not_sure(tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ def test_depth_that_cannot_be_is_noted(value: int, tmp_path: Path) -> None:
     root = write_seven_scenes(tmp_path / "seven")
     for path in root.rglob("*.depth.png"):
         write_png(path, np.full((480, 640), value, np.uint16))
-    assert ("unknown everywhere" if value in (0, 65535) else "hardly indoors") in notes(root)
+    assert ("unknown everywhere" if value in (0, 65535) else "unlikely indoors") in notes(root)
 
 
 def test_a_source_of_which_half_cannot_be_read_is_noted(tmp_path: Path) -> None:
@@ -200,7 +200,7 @@ def test_a_source_of_which_half_cannot_be_read_is_noted(tmp_path: Path) -> None:
 def test_a_depth_scale_that_is_not_of_the_layout_is_noted(tmp_path: Path) -> None:
     root = write_tum(tmp_path / "tum")
     assert "depth-scale" not in notes(root, depth_scale=5000.0, intrinsics=(70.0, 70.0, 39.5, 29.5))
-    assert "makes all 5 times larger: the tum layout has 5000 units" in notes(
+    assert "makes depth 5 times larger: the tum layout has 5000 units" in notes(
         root, depth_scale=1000.0, intrinsics=(70.0, 70.0, 39.5, 29.5)
     )
 

@@ -15,7 +15,7 @@ from list3r.importers.hydra import symbol
 from list3r.importers.importing import IMPORTED, import_map, upright
 from list3r.importers.ply import read_vertices
 from list3r.importers.registry import read_map
-from list3r.importers.standing import doubt_of_up
+from list3r.importers.up_axis import up_axis_notes
 from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.viewer.world import read_world
@@ -197,8 +197,8 @@ def test_a_map_whose_things_stand_along_another_axis_is_told() -> None:
     boxes += [(np.array([0.5 * k, 1.0, 0.75]), np.array([0.1, 0.1, 0.1])) for k in range(5)]
     for axis in ("z", "y", "-x"):
         things = [(points(box) @ upright(axis)).astype(np.float32) for box in boxes]
-        assert doubt_of_up(things, axis) == ()
-        (told,) = doubt_of_up(things, "z" if axis != "z" else "y")
+        assert up_axis_notes(things, axis) == ()
+        (told,) = up_axis_notes(things, "z" if axis != "z" else "y")
         assert f"--up {axis}" in told
 
 

@@ -13,8 +13,8 @@ from list3r.instances.library import build_library
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.motion.follow import follow_movers
 from list3r.reconstruction.motion.moving import SmallFrames, find_moving
+from list3r.reconstruction.motion.moving_tracks import follow_movers
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from tests.rgbd_scenes import BOXES, CAMERA, render, walk
 

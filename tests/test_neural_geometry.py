@@ -346,7 +346,7 @@ def test_wrong_and_damaged_weights_are_one_line(upstream: None, tmp_path: Path) 
     fails(other, "cannot be loaded as Pi3")
     pickled = tmp_path / "evil.pt"
     torch.save({"x": neural_scenes.film}, pickled)
-    fails(pickled, "cannot be loaded|no checkpoint")
+    fails(pickled, "cannot be loaded|not a checkpoint")
     empty = tmp_path / "empty"
     empty.mkdir()
     fails(empty, "holds no weights")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import list3r
-from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
+from list3r.association.revisits.joint_source import JointSourceReconstructor
 from list3r.cli.app import run
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
@@ -178,7 +178,7 @@ def test_windows_of_two_places_are_made_by_the_chunks_own_network(
             opened.sessions.add(str(source), "", {}, 12)
         return opened
 
-    joint = RgbdJointReconstructor({1: str(pictures)}, {1: SourceOptions()}, joint_model(task))
+    joint = JointSourceReconstructor({1: str(pictures)}, {1: SourceOptions()}, joint_model(task))
     made = joint(1, [0, 1, 2, 3], 1, [8, 9, 10, 11])
     assert made is not None and made.scale_kind == "relative"
     with contextlib.ExitStack() as stack:

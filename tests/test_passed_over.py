@@ -13,7 +13,7 @@ import pytest
 from list3r.cli.app import run
 from list3r.frames.base import BadFrame, Frame
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
-from list3r.frames.later import LazyFrame, read_some
+from list3r.frames.deferred import LazyFrame, read_some
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import rotation_exp
 from list3r.memory.store.store import Store

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera, Frame, SourceInfo
 from list3r.frames.options import SourceOptions
-from list3r.frames.pose_agreement import CONVENTIONS, depth_factor, disagreements, wrong_convention
+from list3r.frames.pose_agreement import CONVENTIONS, disagreements
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
 from list3r.pipeline.session import check_agreement
@@ -22,7 +23,7 @@ from tests.rgbd_scenes import CAMERA, frames_along, walk
 
 @pytest.mark.parametrize("kind", WITH_DEPTH)
 def test_poses_as_the_format_states_them_fit(kind: str, tmp_path: Path) -> None:
-    assert wrong_convention(open_source(WITH_DEPTH[kind](tmp_path / "walk"))) is None
+    assert disagreements(open_source(WITH_DEPTH[kind](tmp_path / "walk"))) == ()
 
 
 class Walk:
@@ -51,8 +52,8 @@ def frames() -> list[Frame]:
 @pytest.mark.parametrize("name", list(CONVENTIONS)[:3])
 def test_the_convention_that_was_meant_is_named(name: str, frames: list[Frame]) -> None:
     told = [replace(f, T_source_cam=meant(f.T_source_cam, name)) for f in frames if f.T_source_cam is not None]
-    found = wrong_convention(Walk(told))  # type: ignore[arg-type]
-    assert found == (None if name.startswith("as") else name)
+    found = disagreements(Walk(told))  # type: ignore[arg-type]
+    assert found == () if name.startswith("as") else f"would fit {name}:" in found[0]
 
 
 def test_drift_is_no_other_convention(frames: list[Frame]) -> None:
@@ -61,7 +62,7 @@ def test_drift_is_no_other_convention(frames: list[Frame]) -> None:
         T = np.array(f.T_source_cam)
         T[:3, 3] += 0.01 * k
         drifting.append(replace(f, T_source_cam=T))
-    assert wrong_convention(Walk(drifting)) is None  # type: ignore[arg-type]
+    assert disagreements(Walk(drifting)) == ()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["record3d", "polycam"])
@@ -72,7 +73,7 @@ def test_a_recording_whose_cameras_are_turned_twice_is_refused(
     right = recordings.arkit
     monkeypatch.setattr(recordings, "arkit", lambda T: right(T) @ flip)
     path = WITH_DEPTH[kind](tmp_path / "walk")
-    with pytest.raises(SourceError, match="turned round"):
+    with pytest.raises(SourceError, match="flipped"):
         check_agreement(open_source(path))
 
 
@@ -99,8 +100,11 @@ def test_a_camera_of_another_size_is_refused_and_the_fitting_one_named(tmp_path:
 @pytest.mark.parametrize("times", [0.2, 1.0, 1.3, 5.0])
 def test_depth_in_another_unit_than_its_poses_is_told(times: float, frames: list[Frame]) -> None:
     told = [replace(f, depth=np.float32(times) * f.depth) for f in frames if f.depth is not None]
-    found = depth_factor(Walk(told))  # type: ignore[arg-type]
-    assert found is None if 0.7 < times < 1.5 else found == pytest.approx(1 / times, rel=0.1)
+    found = disagreements(Walk(told))  # type: ignore[arg-type]
+    if 0.7 < times < 1.5:
+        assert found == ()
+    else:
+        assert float(re.search(r"fits ([\d.]+) times", found[0])[1]) == pytest.approx(1 / times, rel=0.1)  # type: ignore[index]
 
 
 def test_disparity_is_told_from_depth(frames: list[Frame]) -> None:
@@ -131,5 +135,5 @@ def test_colour_alone_tells_a_convention_by_its_corners(name: str, frames: list[
     told = [
         replace(f, depth=None, T_source_cam=meant(f.T_source_cam, name)) for f in frames if f.T_source_cam is not None
     ]
-    found = wrong_convention(Walk(told))  # type: ignore[arg-type]
-    assert found == (None if name.startswith("as") else name)
+    found = disagreements(Walk(told))  # type: ignore[arg-type]
+    assert found == () if name.startswith("as") else f"would fit {name}:" in found[0]

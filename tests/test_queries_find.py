@@ -170,11 +170,11 @@ def test_the_grammar_binds_to_the_right_and_and_to_the_first() -> None:
     phrase = parse("white mugs on the table near the door")
     assert phrase.words == ("white", "mug") and len(phrase.where) == 1
     assert phrase.where[0].object.words == ("table",)
-    assert phrase.where[0].object.where[0].said == "near"
+    assert phrase.where[0].object.where[0].wording == "near"
     flat = parse("mug on the table and next to 12")
-    assert [c.said for c in flat.where] == ["on", "next to"] and flat.where[1].object.instance_id == 12
+    assert [c.wording for c in flat.where] == ["on", "next to"] and flat.where[1].object.instance_id == 12
     two = parse("lamp between the sofa and the table and near 3")
-    assert two.where[0].other is not None and two.where[0].other.words == ("table",) and two.where[1].said == "near"
+    assert two.where[0].other is not None and two.where[0].other.words == ("table",) and two.where[1].wording == "near"
     assert parse("mug to the left of 3").where[0].predicates == ("left_of",)
 
 

@@ -122,7 +122,7 @@ def test_words_stand_for_the_same_things(store: Store, words: str, large: pytest
 def test_what_is_common_is_looked_for_around_the_place(store: Store, large: pytest.MonkeyPatch) -> None:
     wanted = nearest(store, words="mug", point=(4.0, 4.0, 1.0), k=9)
     large.setattr(gather, "EVERYTHING", 0)
-    large.setattr("list3r.queries.called._LOADED", 10)
+    large.setattr("list3r.queries.by_words._LOADED", 10)
     found = nearest(store, words="mug", point=(4.0, 4.0, 1.0), k=9)
     assert [(m.instance.id, m.distance_m) for m in found] == [(m.instance.id, m.distance_m) for m in wanted]
 
@@ -149,7 +149,7 @@ def test_a_camera_sees_what_it_saw(store: Store, depth: float | None, monkeypatc
 def test_what_is_left_out_is_said(store: Store, large: pytest.MonkeyPatch) -> None:
     large.setattr(gather, "EVERYTHING", 10)
     large.setattr("list3r.queries.relations._MOST_NAMED", 20)
-    large.setattr("list3r.queries.called._LOADED", 20)
+    large.setattr("list3r.queries.by_words._LOADED", 20)
     assert "more than 20 instances match 'red'; 20 of them" in relations(store, subject="red").reason
     assert relations(store, subject=7).reason == ""
     found = nearest(store, words="red box")
@@ -162,7 +162,7 @@ def test_named_things_that_pass_the_filters_are_found_behind_those_that_do_not(
 ) -> None:
     sure = {m.instance.id for m in nearest(store, words="red", min_confidence=0.85, k=COUNT)}
     large.setattr(gather, "EVERYTHING", 10)
-    large.setattr("list3r.queries.called._LOADED", 1)
+    large.setattr("list3r.queries.by_words._LOADED", 1)
     found = nearest(store, words="red", min_confidence=0.85, k=1)
     assert len(found) == 1 and found[0].instance.id in sure
 

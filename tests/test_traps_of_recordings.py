@@ -99,7 +99,7 @@ def test_frames_with_cameras_of_their_own_agree_to_two_millimetres(
     monkeypatch.setattr(recordings, "shots", lambda: own)
     source = open_source(BREATHING[kind](tmp_path / "walk"))
     coarse = kind == "arkitscenes"  # depth moves by half a pixel at most, and its pictures have 64 of them here
-    assert off_mm(source) < (6.0 if coarse else 2.0) and "carried to one camera" in notes(source)
+    assert off_mm(source) < (6.0 if coarse else 2.0) and "resampled to one camera" in notes(source)
 
 
 def test_a_camera_written_by_rows_or_by_columns_is_the_same(tmp_path: Path) -> None:

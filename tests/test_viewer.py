@@ -29,12 +29,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from list3r.viewer.app import Viewer, ViewerSettings
-from list3r.viewer.beside import SideBySide
 from list3r.viewer.box_lines import thin_lines
 from list3r.viewer.clouds import FINE, CloudSettings
 from list3r.viewer.instance_text import described
 from list3r.viewer.link import ViewState
 from list3r.viewer.names import on_page, with_room
+from list3r.viewer.side_by_side import SideBySide
 from list3r.viewer.world import (
     COLOR_MODES,
     ShownCloud,

@@ -16,7 +16,11 @@ from list3r.association.revisits.whole_chunks.all_keyframes import (
     contradicted,
     place_by_all_keyframes,
 )
-from list3r.association.revisits.whole_chunks.witness import ChunkKeyframes, WitnessSettings, witness
+from list3r.association.revisits.whole_chunks.chunk_agreement import (
+    ChunkAgreementSettings,
+    ChunkKeyframes,
+    chunk_agreement,
+)
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import Edge, Keyframe
 from tests.session_scenes import FOCAL, Box, cast
@@ -105,7 +109,7 @@ def test_the_rest_of_both_chunks_contradicts_a_place_that_a_thing_says(shift: fl
 
 
 def test_two_chunks_say_the_same_of_a_relation_and_of_its_inverse() -> None:
-    u, v = (ChunkKeyframes(k, WitnessSettings()) for k in (FIRST, _keyframes(True, True, GAUGE, 1)))
-    there, back = witness(GAUGE, u, v, (0, 12)), witness(np.linalg.inv(GAUGE), v, u, (12, 0))
+    u, v = (ChunkKeyframes(k, ChunkAgreementSettings()) for k in (FIRST, _keyframes(True, True, GAUGE, 1)))
+    there, back = chunk_agreement(GAUGE, u, v, (0, 12)), chunk_agreement(np.linalg.inv(GAUGE), v, u, (12, 0))
     assert (there.seen, there.agreement) == pytest.approx((back.seen, back.agreement))
     assert there.seen > 0.3

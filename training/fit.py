@@ -125,7 +125,7 @@ def fit(
 
 
 def load_earlier(network: PieceNetwork, folder: Path) -> None:
-    """Take over the weights of an earlier fit; names are matched by their words, new ones start anew."""
+    """Take over the weights of an earlier fit; names are matched by their words, new ones start from scratch."""
     state = torch.load(folder / "state.pt", weights_only=True)
     means = {k.removeprefix("module."): v for k, v in state.get("mean", {}).items() if k.startswith("module.")}
     saved = means or state["network"]

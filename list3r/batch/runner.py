@@ -88,7 +88,7 @@ class BatchReport:
         return asdict(self)
 
 
-Told = Callable[[Outcome, int, int], None]
+OnOutcome = Callable[[Outcome, int, int], None]
 """Called with how an attempt ended, the tasks that are settled, and all."""
 
 
@@ -96,7 +96,7 @@ def run_batch(
     groups: Sequence[Sequence[BatchTask]],
     engine: Engine,
     settings: BatchSettings,
-    told: Told = lambda outcome, settled, total: None,
+    on_outcome: OnOutcome = lambda outcome, settled, total: None,
 ) -> BatchReport:
     """Do the tasks that are not done yet; tasks of one memory one after the other, others side by side.
 
@@ -106,18 +106,18 @@ def run_batch(
     try:
         Output(settings.out).prepare()
         with Ledger(settings.ledger()) as ledger:
-            return _Run(engine, ledger, settings, told).run(groups)
+            return _Run(engine, ledger, settings, on_outcome).run(groups)
     finally:
         engine.cancel()
 
 
-def run_here(group: Sequence[BatchTask], settings: BatchSettings, told: Told) -> BatchReport:
+def run_here(group: Sequence[BatchTask], settings: BatchSettings, on_outcome: OnOutcome) -> BatchReport:
     """Do the tasks of one memory in this process, without a manifest: what an element of an array job does."""
     Output(settings.out).prepare()
     outcomes = []
     for settled, job in enumerate(settings.jobs([group])[0], 1):
         outcomes.append(run_task(job))
-        told(outcomes[-1], settled, len(group))
+        on_outcome(outcomes[-1], settled, len(group))
     done = [o for o in outcomes if o.state == "done"]
     return BatchReport(len(done), sum(o.built for o in done), len(outcomes) - len(done), [_row(o) for o in outcomes])
 
@@ -125,15 +125,15 @@ def run_here(group: Sequence[BatchTask], settings: BatchSettings, told: Told) ->
 def _row(o: Outcome) -> TaskRow:
     t = o.task
     reason = "" if o.state == "done" else o.reason
-    told = (o.state, 1, reason, o.sha256, o.bytes, o.frames, o.instances, o.seconds)
-    return TaskRow(t.memory, t.source, t.source_hash, t.settings_hash, *told)
+    values = (o.state, 1, reason, o.sha256, o.bytes, o.frames, o.instances, o.seconds)
+    return TaskRow(t.memory, t.source, t.source_hash, t.settings_hash, *values)
 
 
 class _Run:
     """The state of one run: which memories wait, and how often their tasks were tried."""
 
-    def __init__(self, engine: Engine, ledger: Ledger, settings: BatchSettings, told: Told) -> None:
-        self._engine, self._ledger, self._settings, self._told = engine, ledger, settings, told
+    def __init__(self, engine: Engine, ledger: Ledger, settings: BatchSettings, on_outcome: OnOutcome) -> None:
+        self._engine, self._ledger, self._settings, self._on_outcome = engine, ledger, settings, on_outcome
         self._waiting: deque[deque[BatchJob]] = deque()
         self._under_way: dict[str, deque[BatchJob]] = {}
         self._lost: dict[str, int] = {}
@@ -179,6 +179,6 @@ class _Run:
             jobs.popleft()
             self._settled += 1
             self._built += outcome.built
-        self._told(outcome, self._settled, self._total)
+        self._on_outcome(outcome, self._settled, self._total)
         if jobs:
             self._waiting.appendleft(jobs)

@@ -24,8 +24,8 @@ def slurm_script(words: Sequence[str], count: int, resources: TaskResources, sid
         lines.append(f"#SBATCH --gpus-per-task={resources.gpus:g}")
     lines += [
         "#SBATCH --requeue",
-        "# An element that is run again goes on where it was, or finds that it is done. When the array has ended, the",
-        "# same command without --only writes the manifest and does what is left:",
+        "# An element that is run again continues where it stopped, or finds that it is done. After the array,",
+        "# the same command without --only writes the manifest and does what is left:",
         f"#   {command}",
         f'exec {command} --only "$SLURM_ARRAY_TASK_ID"',
     ]

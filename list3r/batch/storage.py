@@ -55,9 +55,9 @@ def read_text(where: str) -> str:
         fs, path = _filesystem(where)
         return bytes(fs.cat_file(path)).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        said = getattr(error, "strerror", None) or error
+        reason = getattr(error, "strerror", None) or error
         raise OptionError(
-            f"{where} cannot be read as a manifest: {said}; name a folder, or a file with one video per line"
+            f"{where} cannot be read as a manifest: {reason}; name a folder, or a file with one video per line"
         ) from error
 
 
@@ -127,7 +127,7 @@ class Output:
             else:
                 self._move(file, name, replace)
         except FileExistsError:
-            raise MemoryFileError(f"{self.place(name)} is there already; move it away or name another --out") from None
+            raise MemoryFileError(f"{self.place(name)} exists already; move it away or name another --out") from None
         except OSError as error:
             raise MemoryFileError(f"{self.place(name)} cannot be written: {error.strerror or error}") from error
 

@@ -63,11 +63,11 @@ def read_tasks(where: str, asked: Asked) -> list[list[BatchTask]]:
     if not lines:
         raise OptionError(f"{where} names no video; give a manifest with one video per line, or a folder of videos")
     groups: dict[str, list[BatchTask]] = {}
-    said: dict[str, bool] = {}
+    names_memory: dict[str, bool] = {}
     for at, fields in lines:
         named = "memory" in fields
         task = _task(at, dict(fields), asked)
-        if task.memory in groups and not (named and said[task.memory]):
+        if task.memory in groups and not (named and names_memory[task.memory]):
             raise OptionError(
                 f"{at}: a second video would go to {task.memory}.l3r; name its memory in the manifest, as in "
                 f'{{"source": "{task.source}", "memory": "{task.memory}-2"}}'
@@ -75,7 +75,7 @@ def read_tasks(where: str, asked: Asked) -> list[list[BatchTask]]:
         if any(other.source == task.source for other in groups.get(task.memory, [])):
             raise OptionError(f"{at}: {task.source} is named a second time; remove the line")
         groups.setdefault(task.memory, []).append(task)
-        said[task.memory] = named
+        names_memory[task.memory] = named
     return list(groups.values())
 
 
@@ -119,7 +119,7 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
         options = asked.options_of(fields)
     except TypeError as error:
         unknown = next((name for name in fields if repr(name) in str(error)), ", ".join(fields))
-        raise OptionError(f"{at}: {unknown} is no option of a source; see `list3r build -h`") from None
+        raise OptionError(f"{at}: {unknown} is not an option of a source; see `list3r build -h`") from None
     except List3rError as error:
         raise OptionError(f"{at}: {error}") from error
     settings = [asdict(options), asdict(asked.request), _shaping(asked.run)]

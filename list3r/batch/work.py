@@ -125,7 +125,7 @@ def _published(job: BatchJob, output: Output, copy: Path) -> tuple[tuple[str, ..
 
 @dataclass(frozen=True)
 class _Known:
-    """What is told of a memory that was finished before its task was killed."""
+    """The outcome of a memory that was finished before its task was killed."""
 
     frames: int
     instances: int

@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
 
 MOST_RANKED = 2_000
-"""Instances that words name which are ranked; of more, any so many are."""
+"""Most instances that match some words and are ranked; of more, any of them."""
 
 
 class Backend(Protocol):
     """A database that holds a catalogue. Each call sees one state of it. Raises `CatalogError`."""
 
-    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name; of the same file only when it is asked for `anew`.
+    def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
+        """Write a memory in place of what has its name; of the same file only when it is asked for `again`.
 
         Return its entry, whose revision is the next one where the file is another.
         """
         ...
 
     def loading(self, *, many: bool) -> AbstractContextManager[None]:
-        """Write memories meanwhile; where they are `many`, indices that cost more kept up are made anew at the end."""
+        """Write memories meanwhile; where they are `many`, indices that cost more kept up are made again at the end."""
         ...
 
     def drop(self, name: str) -> bool:
@@ -97,11 +97,11 @@ def open_backend(url: str, connections: int = 1, *, make: bool = True) -> Backen
 
     Without `make` a file that is not there is refused. Raises `CatalogError`.
     """
-    kind, told, rest = url.partition("://")
-    if not told or kind == "sqlite":
+    kind, separator, rest = url.partition("://")
+    if not separator or kind == "sqlite":
         from list3r.catalog.sqlite import SqliteBackend
 
-        path = rest.removeprefix("/") if told else url
+        path = rest.removeprefix("/") if separator else url
         if not make and not Path(path).exists():
             raise CatalogError(f"{path} does not exist; `list3r catalog add FILE... --catalog {path}` makes it")
         return SqliteBackend(path)
@@ -117,9 +117,9 @@ def wanted_sql(
 ) -> tuple[str, list[Any]]:
     """Return the condition (with `?` for values) that an instance is wanted, and its values.
 
-    `words` makes the condition of bearing words, of an alias and the words. Relations are looked up for each that bears
+    `words` makes the condition of having words, of an alias and the words. Relations are looked up for each that has
     the words: OFFSET keeps PostgreSQL from joining them instead, which takes minutes in one memory where it has no
-    statistics yet. Over all memories joining them is many times faster, from the end that fewer bear: `joined`.
+    statistics yet. Over all memories joining them is many times faster, from the end that fewer have: `joined`.
     """
     parts, values = ["TRUE"], []
     if wanted.words:

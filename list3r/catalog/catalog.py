@@ -1,4 +1,4 @@
-"""The face of a catalogue: the questions that one memory answers, asked of one of many or of all."""
+"""The face of a catalogue: the questions that one memory answers, for one of many memories or for all."""
 
 from __future__ import annotations
 
@@ -95,11 +95,11 @@ class Catalog:
         return self._backend.put(content)
 
     def again(self, path: str, name: str | None = None) -> MemoryEntry:
-        """Write a memory anew from its file; its revision stays where the file is the same."""
-        return self._backend.put(read_content(path, name), anew=True)
+        """Write a memory again from its file; its revision stays where the file is the same."""
+        return self._backend.put(read_content(path, name), again=True)
 
     def loading(self, count: int) -> AbstractContextManager[None]:
-        """Take in so many memories meanwhile: where the catalogue knows fewer, its indices are made anew at the end."""
+        """Add this many memories meanwhile: if the catalogue has fewer, its indices are built again at the end."""
         return self._backend.loading(many=count > len(self._backend.memories()))
 
     def remove(self, name: str) -> None:
@@ -142,8 +142,8 @@ class Catalog:
             if len(near) < count or (len(found) == k and found[-1][0] <= near[-1].aabb_distance(at)):
                 break
             count *= 4
-        whence = "the point" if own is None else f"the centre of #{own}"
-        return self._answers(((t, 1.0 / (1.0 + d), d, f"box {d:.2f} from {whence}") for d, _, t in found), [entry])
+        reference = "the point" if own is None else f"the centre of #{own}"
+        return self._answers(((t, 1.0 / (1.0 + d), d, f"box {d:.2f} from {reference}") for d, _, t in found), [entry])
 
     def within(
         self,
@@ -173,7 +173,7 @@ class Catalog:
         region = low.tolist(), high.tolist()
         entry, met = _of(memory, self._backend.inside(printable(memory), *region, filters, MOST_ANSWERS + 1))
         found = _by_distance(met, middle)
-        notes = [f"more than {MOST_ANSWERS} things are there; so many are told"] if len(met) > MOST_ANSWERS else []
+        notes = [f"more than {MOST_ANSWERS} things are there; only these are listed"] if len(met) > MOST_ANSWERS else []
         rows = (
             (t, 1.0 / (1.0 + d), d, f"box {d:.2f} from the middle") for d, _, t in found[:MOST_ANSWERS] if d <= reach
         )
@@ -191,9 +191,9 @@ class Catalog:
         if not STRUCTURE.isdisjoint(wanted.words):
             filters = CatalogFilters(True, filters.min_confidence, filters.state)
         found, ranked = self._backend.named(memory, wanted, k, filters)
-        notes = [f"{ranked} things match {text!r} or more; so many were ranked"] if ranked >= MOST_RANKED else []
-        said = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
-        return self._answers(((t, score, None, said) for t, score in found), entries, notes)
+        notes = [f"{ranked} or more things match {text!r}; only {ranked} were ranked"] if ranked >= MOST_RANKED else []
+        wording = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
+        return self._answers(((t, score, None, wording) for t, score in found), entries, notes)
 
     def similar(
         self,
@@ -268,7 +268,7 @@ class Catalog:
         found, name = None, printable(memory)
         if 0 <= instance_id <= _LARGEST_ID:
             found = self._backend.thing(name, instance_id)
-            if found is None:  # there is no such memory, or it was taken in anew since it was last asked for
+            if found is None:  # there is no such memory, or it was taken in again since it was last asked for
                 found = self._backend.thing(self.memory(name).name, instance_id)
         if found is None:
             raise UnknownIdError(f"the catalogue has no instance {instance_id} in {memory}")
@@ -312,10 +312,10 @@ class Catalog:
     ) -> CatalogAnswers:
         held = list(rows)
         by_name = self._by_name(known, (t.memory for t, *_ in held))
-        found = [_match(t, *by_name[t.memory], told) for t, *told in held if t.memory in by_name]
+        found = [_match(t, *by_name[t.memory], notices) for t, *notices in held if t.memory in by_name]
         stale = sorted({m.memory for m in found if m.stale})
-        told = [f"{n} has changed since it was added; `list3r catalog add` adds the present file" for n in stale]
-        return CatalogAnswers(found, [*notes, *told])
+        notices = [f"{n} has changed since it was added; `list3r catalog add` adds the current file" for n in stale]
+        return CatalogAnswers(found, [*notes, *notices])
 
 
 def _of(name: str, found: tuple[MemoryEntry, list[CatalogThing]] | None) -> tuple[MemoryEntry, list[CatalogThing]]:
@@ -354,8 +354,8 @@ def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> 
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
 
 
-def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, told: Sequence[Any]) -> CatalogMatch:
-    score, distance, reason = told
+def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, found: Sequence[Any]) -> CatalogMatch:
+    score, distance, reason = found
     return CatalogMatch(
         t.memory,
         entry.revision,
@@ -393,7 +393,7 @@ def _wanted(phrase: Phrase) -> Wanted:
     for clause in phrase.where:
         stored = tuple(p for p in clause.predicates if p not in VIEWPOINT)
         if not stored:
-            raise OptionError(f"{phrase.text!r}: {clause.said!r} depends on the viewpoint; ask the memory's file")
+            raise OptionError(f"{phrase.text!r}: {clause.wording!r} depends on the viewpoint; ask the memory's file")
         where.append((stored, _wanted(clause.object)))
     if not phrase.words and not where:
         raise OptionError(f"{phrase.text!r} has no word to search for; name an object, a colour or a shape")

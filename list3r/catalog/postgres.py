@@ -37,8 +37,8 @@ _BUILD_MEMORY = "2GB"
 _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
 _WIDE, _LISTS_OF_WIDE = 128, 20
-"""Numbers of a vector beyond which so many lists are looked at instead of 40: wider vectors take longer to compare, and
-fewer lists find as many. docs/decisions/0141-lists-of-vectors.md."""
+"""Vectors with more numbers than the first are searched in as many lists as the second says, instead of 40: they take
+longer to compare, and fewer lists find as many. docs/decisions/0141-lists-of-vectors.md."""
 _WRITTEN = "written"
 _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""
@@ -57,7 +57,7 @@ class PostgresBackend:
 
     # ------------------------------------------------------------------ writing
 
-    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+    def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name, in one transaction."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
@@ -68,7 +68,7 @@ class PostgresBackend:
             )
             row = _first(connection.execute(statement, astuple(content.entry)))
             memory, known = int(row[0]), MemoryEntry(*row[1:])
-            if known.revision and not anew and replace(content.entry, revision=known.revision) == known:
+            if known.revision and not again and replace(content.entry, revision=known.revision) == known:
                 return known
             same = known.revision and known.sha256 == content.entry.sha256
             entry = replace(content.entry, revision=known.revision + (not same))
@@ -125,7 +125,7 @@ class PostgresBackend:
     def loading(self, *, many: bool) -> Iterator[None]:
         """Write memories; at the end vectors that have become many get an index, or one of more lists.
 
-        Where `many` are written, indices are made anew at the end and not kept up meanwhile: until then `similar` over
+        Where `many` are written, indices are made again at the end and not kept up meanwhile: until then `similar` over
         all compares all vectors. An index that is missing, since a load was ended, is made.
         """
         if many:
@@ -173,8 +173,8 @@ class PostgresBackend:
     def _placed(self, memory: str, which: str, values: Sequence[Any]) -> tuple[MemoryEntry, list[CatalogThing]] | None:
         """Return a memory and those of its instances that a condition tells, by one way to the server.
 
-        The number that is known of the memory leaves one partition to the plan; where it is gone, it is looked up anew.
-        It is told as what the column is: psycopg sends small numbers as `smallint`, which the index of (memory, box)
+        With the known number of the memory the plan reads one partition; if it is gone, it is looked up again. It is
+        passed with the type of the column: psycopg sends small numbers as `smallint`, which the index of (memory, box)
         does not compare, so that it would be gone through over all memories of the partition.
         """
         chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ?::integer AND {which}) i"
@@ -337,8 +337,8 @@ class PostgresBackend:
 
     def _failed(self, what: str, error: psycopg.Error) -> CatalogError:
         if what == _WRITTEN:
-            what += "; the same again is safe" if _lost(error) else "; nothing was changed"
-        return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_said(error)}")
+            what += "; running the same command again is safe" if _lost(error) else "; nothing was changed"
+        return CatalogError(f"the catalogue at {self._where} cannot be {what}: {_first_line(error)}")
 
 
 def _lost(error: psycopg.Error) -> bool:
@@ -362,7 +362,7 @@ def _checked(url: str) -> str:
     return f"{parts.hostname or 'this machine'}{parts.path}"
 
 
-def _said(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """Return in one line what the server or the library says."""
     text = getattr(getattr(error, "diag", None), "message_primary", None) or str(error).strip() or type(error).__name__
     return str(text).splitlines()[0]
@@ -431,9 +431,9 @@ def _copy_things(connection: psycopg.Connection[Any], memory: int, content: Memo
         with cursor.copy("COPY instance FROM STDIN") as copy:
             for t in content.things:
                 bounds = ",".join(map(_corner, t.bounds()))
-                told = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
+                values = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
                 words = list(t.words), list(t.words.values())
-                copy.write_row((memory, t.id, *told, t.box_numbers(), bounds, *words))
+                copy.write_row((memory, t.id, *values, t.box_numbers(), bounds, *words))
         with cursor.copy("COPY relation FROM STDIN") as copy:
             for row in content.relations:
                 copy.write_row((memory, *row))

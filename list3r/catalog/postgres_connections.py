@@ -1,4 +1,4 @@
-"""Connections to PostgreSQL: so many at the most, made when they are needed, and made anew when they are lost."""
+"""Connections to PostgreSQL: at most a fixed number, opened when they are needed and again when they are lost."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def vector_table(space_id: int, dimension: int) -> str:
 
 
 def lists_of(vectors: int) -> int:
-    """Return into how many lists the index divides so many vectors, 0 for none."""
+    """Return into how many lists the index divides this many vectors, 0 for none."""
     return min(vectors // _A_LIST, _MOST_LISTS) if vectors >= FEWEST_INDEXED else 0
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.errors import List3rError, check_choice, check_share
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Shape
 from list3r.queries.match import STATES
@@ -64,7 +64,7 @@ class CatalogThing:
     component: int
     box: OrientedBox
     words: dict[str, int]
-    """Words that it bears, with how well each names it, in hundredths; empty in answers."""
+    """Words that it has, with how well each names it, in hundredths; empty in answers."""
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """Return the lower and upper corner of its axis-aligned box, world units."""
@@ -113,10 +113,9 @@ class CatalogFilters:
     """present, moved, removed, added, unseen, or any; None for all that are not known to be gone."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.min_confidence <= 1.0:
-            raise OptionError(f"min_confidence {self.min_confidence} must lie between 0 and 1")
-        if self.state is not None and self.state not in STATES:
-            raise OptionError(f"state {self.state!r} is not known; choose one of: {', '.join(STATES)}")
+        check_share("min_confidence", self.min_confidence)
+        if self.state is not None:
+            check_choice("state", self.state, STATES)
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class Wanted:
     """Instances that a question asks for: by words or an id, and how they stand to others."""
 
     words: tuple[str, ...] = ()
-    """All of which it must bear."""
+    """All of which it must have."""
     instance_id: int | None = None
     where: tuple[tuple[tuple[str, ...], Wanted], ...] = ()
     """Predicates, of which one must hold, and the object."""

@@ -74,12 +74,12 @@ class SqliteBackend:
     def _tables(self) -> bool:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
-    def put(self, content: MemoryContent, *, anew: bool = False) -> MemoryEntry:
+    def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
         """Write a memory in place of what has its name."""
         with self._writing():
             known = self.memories([content.entry.name])
             before = known[0] if known else content.entry
-            if known and not anew and replace(content.entry, revision=before.revision) == before:
+            if known and not again and replace(content.entry, revision=before.revision) == before:
                 return before
             same = bool(known) and before.sha256 == content.entry.sha256
             entry = replace(content.entry, revision=before.revision + (not same))
@@ -96,7 +96,7 @@ class SqliteBackend:
         first = int(database.execute("SELECT coalesce(max(number), 0) + 1 FROM instance").fetchone()[0])
         things = list(enumerate(content.things, first))
         marks = ", ".join("?" for _ in range(11))
-        rows = ((n, memory, *_told(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in things)
+        rows = ((n, memory, *_columns_of(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in things)
         database.executemany(f"INSERT INTO instance VALUES ({marks})", rows)
         boxes = ((n, *(v for pair in zip(*t.bounds(), strict=True) for v in pair), memory, memory) for n, t in things)
         database.executemany("INSERT INTO bounds VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", boxes)
@@ -115,7 +115,7 @@ class SqliteBackend:
 
     @contextlib.contextmanager
     def loading(self, *, many: bool) -> Iterator[None]:
-        """Write memories: nothing is to be made anew here."""
+        """Write memories: nothing is to be made again here."""
         yield
 
     def drop(self, name: str) -> bool:
@@ -323,12 +323,12 @@ class SqliteBackend:
             raise CatalogError(f"{self._path} cannot be written: {error}; nothing was changed") from error
 
 
-def _told(t: CatalogThing) -> tuple[object, ...]:
+def _columns_of(t: CatalogThing) -> tuple[object, ...]:
     return t.id, t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
-    """Over all memories: what bears a word is looked up."""
+    """Over all memories: what has a word is looked up."""
     one = f"{alias}.number IN (SELECT number FROM word WHERE word = ?)"
     return " AND ".join([one] * len(words)), list(words)
 
@@ -354,8 +354,8 @@ def _thing(row: Sequence[Any]) -> CatalogThing:
 def thing_of(row: Sequence[Any], box: NDArray[np.float64]) -> CatalogThing:
     """Return an instance of a row of its fields and the 15 numbers of its box."""
     memory, id, label, description, state, structure, confidence, sigma, component = row[:9]
-    told = (label, description, state, structure, confidence, sigma, component)
-    return CatalogThing(memory, id, *told, box_of(box), {})
+    values = (label, description, state, structure, confidence, sigma, component)
+    return CatalogThing(memory, id, *values, box_of(box), {})
 
 
 def box_of(numbers: NDArray[np.float64]) -> OrientedBox:

@@ -1,6 +1,6 @@
 """The program `list3r`: its commands, and the one place where errors become one line and an exit status.
 
-Status 0: done. 1: the program failed, was interrupted, or a check found damage. 2: the input is wrong, and how to mend
+Status 0: done. 1: the program failed, was interrupted, or a check found damage. 2: the input is wrong, and how to fix
 it is said.
 """
 
@@ -21,8 +21,8 @@ import typer.core
 
 from list3r.cli.answer import print_error, wants_json
 from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
+from list3r.memory.address_space import BUILD_MB, check_address_space
 from list3r.memory.errors import List3rError, naming_extras
-from list3r.memory.room import BUILD_MB, check_address_space
 
 MODULES: dict[str, tuple[str, ...]] = {
     "build.commands": ("inspect", "build", "demo"),
@@ -143,7 +143,7 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
 
 def run(arguments: list[str]) -> int:
     """Run one command; its exit status. What failed is said in one line, with `--json` in an answer as well."""
-    told = _Failures(wants_json(arguments))
+    failures = _Failures(wants_json(arguments))
     try:
         if arguments and arguments[0] in _BUILDING:
             check_address_space(BUILD_MB, f"list3r {arguments[0]}")
@@ -155,11 +155,11 @@ def run(arguments: list[str]) -> int:
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except _USAGE_ERROR as error:
-        return told.usage(error)
+        return failures.usage(error)
     except _COMMAND_ERROR as error:
-        return told.fail("OptionError", error.format_message())  # type: ignore[attr-defined]
+        return failures.fail("OptionError", error.format_message())  # type: ignore[attr-defined]
     except List3rError as error:
-        return _unwritten(error) if isinstance(error, OutputError) else told.fail(type(error).__name__, str(error))
+        return _unwritten(error) if isinstance(error, OutputError) else failures.fail(type(error).__name__, str(error))
     except (KeyboardInterrupt, typer.Abort):
         tell("", "interrupted")
         return 1
@@ -168,9 +168,9 @@ def run(arguments: list[str]) -> int:
             raise
         return _unheard()
     except (RuntimeError, OSError) as error:
-        return told.fail_of_system(error)
+        return failures.fail_of_system(error)
     except (MemoryError, ImportError) as error:
-        return told.fail_of_memory(error)
+        return failures.fail_of_memory(error)
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class _Failures:
         """Memory that ran out, which libraries that are loaded tell in their own way; exit status 1."""
         if isinstance(error, ImportError) and "failed to map" not in str(error):
             raise error
-        message = "the memory that this process may use ran out; raise the limit (ulimit -v, or that of the container)"
+        message = "the process ran out of memory; raise its limit (ulimit -v, or that of the container)"
         self.fail("MemoryError", message)
         return 1
 

@@ -96,11 +96,11 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in signature.parameters.items():
-        group, *told = get_args(parameter.annotation) or (parameter.annotation,)
+        group, *markers = get_args(parameter.annotation) or (parameter.annotation,)
         if not is_dataclass(group):
             options.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
             continue
-        groups[name] = group, [o for o in _options_of(group) if not told or o.name in told[0]]
+        groups[name] = group, [o for o in _options_of(group) if not markers or o.name in markers[0]]
         options += groups[name][1]
 
     @functools.wraps(command)
@@ -133,18 +133,18 @@ def _gathered(group: Any, given: dict[str, Any]) -> Any:
 
 def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:
     """Return the parameter that typer makes an option of."""
-    told = f.metadata.get("help")
-    if told is None:
+    help_ = f.metadata.get("help")
+    if help_ is None:
         return inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kind)
     default = f.default
     if get_origin(kind) is tuple:
         kind, default = list[str] | None, None
     option = typer.Option(
-        told.flag or f"--{f.name.replace('_', '-')}",
-        metavar=told.metavar,
-        help=told.text,
+        help_.flag or f"--{f.name.replace('_', '-')}",
+        metavar=help_.metavar,
+        help=help_.text,
         show_default=default is not None and default is not False,
-        autocompletion=_choices(told.metavar or ""),
+        autocompletion=_choices(help_.metavar or ""),
     )
     return inspect.Parameter(
         f.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
@@ -158,8 +158,8 @@ def _choices(metavar: str) -> Callable[[], list[str]] | None:
 
 def _given(group: Any, name: str, value: Any) -> Any:
     """Return the value of an option as the dataclass has it: several words are a tuple."""
-    told = any(f.name == name and "help" in f.metadata for f in fields(group))
-    several = told and (value is None or isinstance(value, list))
+    declared = any(f.name == name and "help" in f.metadata for f in fields(group))
+    several = declared and (value is None or isinstance(value, list))
     default = next(f.default for f in fields(group) if f.name == name)
     return tuple(value or ()) if several and isinstance(default, tuple) else value
 
@@ -170,18 +170,18 @@ _DRAWN_ROWS = 200
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
     """Left-aligned columns under a header; a word where there are no rows. A short table on a terminal is drawn."""
-    told = [[_cell(v) for v in row] for row in rows]
-    if not told:
+    shown_rows = [[_cell(v) for v in row] for row in rows]
+    if not shown_rows:
         say("nothing found")
         return
-    if len(told) <= _DRAWN_ROWS and draws(sys.stdout):
+    if len(shown_rows) <= _DRAWN_ROWS and draws(sys.stdout):
         from list3r.cli.drawing import drawn_table
 
-        table = drawn_table(header, told)
+        table = drawn_table(header, shown_rows)
         if table is not None:
             write(table)
             return
-    cells = [list(header), *told]
+    cells = [list(header), *shown_rows]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

@@ -67,7 +67,7 @@ def covisibility(
 
     A point of frame i is seen in frame j when it lies in j's picture, seen from about the same side, and j's depth
     there agrees: within the tolerance of the span of the four pixels around it, so that a steep surface on a coarse
-    map is not lost. Where j has no depth the point tells nothing and is left out, though at most half of them.
+    map is not lost. Where j has no depth the point says nothing and is left out, though at most half of them.
     Rows and columns of frames without a finite pose or without depth are NaN. Raises `OptionError` for shapes that do
     not fit.
     """

@@ -52,7 +52,7 @@ def save(figure: Figure, path: str | Path) -> None:
 def page_axes(T_world_cam: Array) -> tuple[Array, str]:
     """Return page's right and up in the world for a view from above, shape (2, 3), and what it is seen along, in words.
 
-    What is up is told by the cameras: the axis of the world nearest to their mean up if it is within 30 degrees, else
+    Up is taken from the cameras: the axis of the world nearest to their mean up if it is within 30 degrees, else
     that mean.
     """
     up = -T_world_cam[:, :3, 1].mean(axis=0)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from list3r.evaluation.cloud import Array, near_order
 from list3r.frames.files import check_ordinary
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, first_line
 from list3r.memory.geometry import Sim3
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
@@ -59,7 +59,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     except SourceError:
         raise
     except Exception as error:  # the readers of five formats raise whatever they like
-        raise SourceError(f"{path} cannot be read as {ending}: {_first_line(error)}") from error
+        raise SourceError(f"{path} cannot be read as {ending}: {first_line(error)}") from error
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise SourceError(f"{path} holds an array of shape {points.shape}; want points (N, 3)")
@@ -122,7 +122,7 @@ def _read_mesh(path: Path) -> tuple[Any, Any, str]:
 
 
 def thinned(cloud: PointCloud, voxel_m: float, most: int | None = None) -> PointCloud:
-    """Return one point for each occupied cell of a grid: mean of its points and of their normals; then at most so many.
+    """Return one point for each occupied cell of a grid, the mean of its points and normals, and at most `most`.
 
     The mean hides no error larger than the cell, and makes two clouds of different density comparable.
     """
@@ -182,7 +182,3 @@ def estimate_normals(points: ArrayLike, neighbours: int = 24) -> Array:
 def _unit(vectors: Array) -> Array:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), [0.0, 0.0, 1.0]))
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]

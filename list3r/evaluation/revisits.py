@@ -34,7 +34,7 @@ class RevisitTruthSettings:
     """Share of the surface, either way, below which two frames see different places: below 10 % even the pairs of
     MegaDepth's hardest training sets end."""
     precision: float = 0.99
-    """Least precision at which the recall of a ranking is told: one false loop can bend a map."""
+    """Least precision at which the recall of a ranking is reported: one false loop can bend a map."""
 
     def __post_init__(self) -> None:
         if not 0 < self.different <= self.least <= 1:

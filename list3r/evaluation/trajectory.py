@@ -263,7 +263,7 @@ def position_errors(truth: Trajectory, estimate: Trajectory, S_truth_estimate: S
 
 
 def scaled_by(trajectory: Trajectory, scale: float) -> Trajectory:
-    """Return the same views from positions that are so many times further apart."""
+    """Return the same views from positions that are this many times further apart."""
     poses = trajectory.T_world_cam.copy()
     poses[:, :3, 3] *= scale
     return Trajectory(trajectory.time_s, poses)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.exporters.components import Component, component_files, has_box, thinned_support
 from list3r.exporters.output import units, write_together
 from list3r.exporters.palette import Color, instance_color, linear_from_srgb, structure_color
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import check_choice
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 
@@ -34,13 +34,12 @@ class GlbSettings:
     color: str = "rgb"
     """Of the points. rgb: the colours that were seen; instance: one colour an instance, the same in every export."""
     points_per_instance: int = 5000
-    """At most so many points of a thing."""
+    """At most this many points of a thing."""
     points_per_structure: int = 20000
-    """At most so many points of a floor, a wall and the like."""
+    """At most this many points of a floor, a wall and the like."""
 
     def __post_init__(self) -> None:
-        if self.color not in ("instance", "rgb"):
-            raise OptionError(f"points are coloured by instance or rgb, not {self.color!r}")
+        check_choice("color", self.color, ("instance", "rgb"))
 
 
 def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = None) -> tuple[Path, ...]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from list3r.exporters.components import Component, component_files, thinned_support
 from list3r.exporters.output import units, write_together
 from list3r.exporters.palette import instance_color, structure_color
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import check_choice
 from list3r.memory.store.store import Store
 
 _VERTEX = np.dtype(
@@ -40,11 +40,10 @@ class PlySettings:
     structure: bool = True
     """Whether floor, walls and the like are written too."""
     points_per_instance: int | None = None
-    """At most so many points of each instance, all of them for None."""
+    """At most this many points of each instance, all of them for None."""
 
     def __post_init__(self) -> None:
-        if self.color not in ("instance", "rgb"):
-            raise OptionError(f"points are coloured by instance or rgb, not {self.color!r}")
+        check_choice("color", self.color, ("instance", "rgb"))
 
 
 def write_ply(store: Store, path: str | Path, settings: PlySettings | None = None) -> tuple[Path, ...]:

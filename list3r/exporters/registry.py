@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from list3r.exporters.output import check_target
-from list3r.memory.errors import OptionError
-from list3r.memory.room import USD_MB, check_address_space
+from list3r.memory.address_space import USD_MB, check_address_space
+from list3r.memory.errors import OptionError, check_choice
 
 if TYPE_CHECKING:  # the command line reads the names of the formats before anything heavy is needed
     from list3r.api import SceneMemory
@@ -20,7 +20,7 @@ Writer = Callable[..., tuple[Path, ...]]
 
 
 class ExportOptions(TypedDict, total=False):
-    """What may be asked of formats; each has some of them, None is its default."""
+    """Options of formats; each has some of them, None is its default."""
 
     color: str | None
     tokens: int | None
@@ -52,7 +52,7 @@ class Format:
     settings: str = ""
     """The dataclass of its options."""
     address_space_mb: int = 0
-    """Address space that its libraries take, MiB; 0 where it is nothing to speak of."""
+    """Address space that its libraries take, MiB; 0 where it is negligible."""
     options: tuple[str, ...] = ()
     """Fields of the settings that can be asked for, see `ExportOptions`."""
 
@@ -139,8 +139,7 @@ def export(
 
 def find_format(name: str) -> Format:
     """Return a format. Raises `OptionError` that names the known ones."""
-    if name not in FORMATS:
-        raise OptionError(f"unknown format {name!r}; there are {', '.join(FORMATS)}")
+    check_choice("format", name, FORMATS)
     return FORMATS[name]
 
 

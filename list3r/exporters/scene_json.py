@@ -97,7 +97,7 @@ def _vector(values: ArrayLike, decimals: int) -> list[float] | None:
 def instance_entry(
     instance: Instance, decimals: int = _METRIC_DECIMALS, track: tuple[ArrayLike, ArrayLike] | None = None
 ) -> dict[str, Any]:
-    """Return one entry of `instances`; lengths rounded to so many decimals.
+    """Return one entry of `instances`; lengths rounded to this many decimals.
 
     `track` are the seconds (V,) and places (V, 3) of a thing that moves; without them the entry has none.
     """

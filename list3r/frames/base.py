@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -160,6 +161,29 @@ class FrameSource(Protocol):
     def position(self, index: int) -> int:
         """Return where a frame (Frame.index) is among those handed out."""
         ...
+
+
+class Reader(ABC):
+    """What the readers of recordings share: a `FrameSource` that can also read every N-th frame."""
+
+    _info: SourceInfo
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was recognised."""
+        return self._info
+
+    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
+        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
+        return self.read_every(start, stop, 1)
+
+    @abstractmethod
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but only each `step`-th frame from `start` on."""
+
+    @abstractmethod
+    def position(self, index: int) -> int:
+        """Return where a frame (Frame.index) is among those handed out."""
 
 
 def index_at(source: FrameSource, position: int) -> int:

@@ -15,7 +15,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import check_bad_share, open_source, require_camera
 from list3r.frames.writers.base import MakeWriter, SequenceWriter
-from list3r.memory.errors import ExportError, OptionError, SourceError
+from list3r.memory.errors import ExportError, SourceError, check_choice
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,7 @@ def convert(
 
 
 def _layout(name: str) -> OutputLayout:
-    if name not in LAYOUTS:
-        raise OptionError(f"--to {name} is not known; choose {', '.join(LAYOUTS)}")
+    check_choice("--to", name, LAYOUTS)
     return LAYOUTS[name]
 
 

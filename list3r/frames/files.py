@@ -42,11 +42,11 @@ def open_ordinary(path: Path, most_bytes: int = MAX_FILE_BYTES) -> BinaryIO:
 
 
 def check_ordinary(found: os.stat_result, path: Path, most_bytes: int = MAX_FILE_BYTES) -> None:
-    """Raise `OSError` for what is no ordinary file, and for one that is too large."""
+    """Raise `OSError` for what is not a regular file, and for one that is too large."""
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "it is a device or pipe, no ordinary file", str(path))
+        raise OSError(errno.EINVAL, "it is a device or pipe, not a regular file", str(path))
     if found.st_size > most_bytes:
         text = f"it has {found.st_size >> 20} MiB; at most {most_bytes >> 20} are read"
         raise OSError(errno.EFBIG, text, str(path))

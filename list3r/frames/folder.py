@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import (
     clean_depth,
     fault_of,
@@ -27,15 +27,15 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal
-from list3r.frames.later import LazyFrame
+from list3r.frames.deferred import LazyFrame
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
-from list3r.frames.leftovers import not_read
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
+from list3r.frames.unread import not_read
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
@@ -47,13 +47,13 @@ _POSES_TRIED = 50
 _FILES_TRIED = 12
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
-NOWHERE_SURE = "the sensor is sure of no depth that was looked at; is `confidence` of this recording?"
+NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `confidence` belong to this recording?"
 
 
 NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not taken over"
 
 
-class FolderSource:
+class FolderSource(Reader):
     """A `FrameSource` over files; nothing is kept between frames."""
 
     def __init__(self, root: Path, layout: FolderLayout, options: SourceOptions) -> None:
@@ -76,21 +76,12 @@ class FolderSource:
         fractions = self._floats and options.depth_scale is None and optics.depth_scale not in (None, 1.0)
         if fractions and self._typical_raw <= _MOST_M:  # larger numbers with fractions are in the layout's unit
             self.optics = optics = replace(optics, depth_scale=1.0)
-            notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale says otherwise")
+            notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale changes that")
         self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side)
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
         self._info = self._describe(root, (*notes, *self._doubts()))
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
@@ -250,13 +241,13 @@ class FolderSource:
 
     def _scale_doubts(self) -> tuple[str, ...]:
         """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
-        said, usual = self._options.depth_scale, self._layout.optics.depth_scale
-        if not self._has_depth or said is None or usual is None or usual == said:
+        given, usual = self._options.depth_scale, self._layout.optics.depth_scale
+        if not self._has_depth or given is None or usual is None or usual == given:
             return ()
-        times = usual / said
+        times = usual / given
         how = f"{times:.3g} times larger" if times > 1 else f"{1 / times:.3g} times smaller"
         kind = self._layout.kind
-        return (f"--depth-scale {said:g} makes all {how}: the {kind} layout has {usual:g} units a metre",)
+        return (f"--depth-scale {given:g} makes depth {how}: the {kind} layout has {usual:g} units a metre",)
 
     def _camera_doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with the camera: a centre far from the middle is that of another size."""
@@ -287,8 +278,8 @@ class FolderSource:
         if _LEAST_M <= typical_m <= _MOST_M:
             return (NOWHERE_SURE,) if self._nowhere_sure() else ()
         if typical_m == 0:
-            return ("the depth that was looked at is unknown everywhere (all 0, or all of the largest value)",)
-        return (f"depth is {typical_m:.3g} m in the middle of its range, hardly indoors: --depth-scale may be wrong",)
+            return ("the sampled depth is unknown everywhere (all 0, or all of the largest value)",)
+        return (f"depth is typically {typical_m:.3g} m, which is unlikely indoors: --depth-scale may be wrong",)
 
     def _nowhere_sure(self) -> bool:
         """Whether no frame that is looked at has depth that the sensor is sure enough of."""
@@ -303,7 +294,7 @@ class FolderSource:
         wrong = sum(self._pose(f) is None for f in some)
         if not wrong:
             return ()
-        return (f"{wrong} of {len(some)} poses looked at are no rigid motion (mirrored, stretched or not finite)",)
+        return (f"{wrong} of {len(some)} poses looked at are not rigid motions (mirrored, stretched or not finite)",)
 
     def _count_doubts(self) -> tuple[str, ...]:
         """Return how many frames lack a pose or a depth image that others have."""
@@ -331,7 +322,10 @@ class FolderSource:
         if rig.color_size != rig.stored_size:
             notes = (*notes, reduced_note(rig))
         if self._bits < 16:
-            notes = (*notes, f"of the 16 bits of the pictures {self._bits} are in use, which count as full brightness")
+            notes = (
+                *notes,
+                f"the pictures use {self._bits} of their 16 bits, which are taken as the full range of brightness",
+            )
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration
         if layout.z_up and turns is None and len(layout.files.that_hold(POSE_FILE | POSE)):
@@ -393,16 +387,16 @@ def centred_camera(focal: float, rig: Rig) -> Camera:
 def reduced_note(rig: Rig) -> str:
     """That frames are smaller than stored, for people."""
     (h, w), (height, width) = rig.stored_size, rig.color_size
-    return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side says otherwise (0: never)"
+    return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side changes that (0: never)"
 
 
 def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOptions) -> str:
     """Hash of the files' names and sizes and of every option that shapes frames. 32 hexadecimal digits."""
-    said = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
+    given = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
     found = hashlib.sha256(f"({kind!r}, [".encode())  # as the text of a tuple that is never whole in memory
     for number, row in enumerate(listing):
         found.update((", " if number else "").encode() + repr(row).encode())
-    found.update(f"], {sorted(said.items())!r})".encode())
+    found.update(f"], {sorted(given.items())!r})".encode())
     return found.hexdigest()[:32]
 
 

@@ -67,7 +67,7 @@ class SourceReport:
             f"vertical     {_vertical_text(info)}",
             *(f"note         {note}" for note in info.notes),
             *(f"missing      {what}" for what in info.missing),
-            *(f"wrong        {what}; build refuses such poses (--poses estimate does without)" for what in self.wrong),
+            *(f"wrong        {what}; build refuses such poses (--poses estimate needs none)" for what in self.wrong),
             *([] if self.calibration is None else _calibration_lines(self.calibration)),
             *([] if self.overlay is None else [f"overlay      {self.overlay}"]),
         ]
@@ -128,12 +128,12 @@ def _depth_text(info: SourceInfo) -> str:
 
 
 def _poses_text(info: SourceInfo) -> str:
-    """Return whether there are poses, and what a build makes of them unless it is told otherwise."""
+    """Return whether there are poses, and what a build makes of them by default."""
     if not info.has_poses:
         return "none; build estimates them"
     if info.poses_drift and info.poses_metric and info.has_depth:
         return "given; build corrects them by the depth (--poses prior), since they drift"
-    return "given; build takes them as they are (--poses given)"
+    return "given; build uses them as they are (--poses given)"
 
 
 def _scale_text(info: SourceInfo) -> str:
@@ -142,7 +142,7 @@ def _scale_text(info: SourceInfo) -> str:
         return "metric, by the depth"
     if info.has_poses:
         return "metric, by the poses" if info.poses_metric else "relative, in the unit of the poses"
-    return "relative; build --scale-anchor says how long something is"
+    return "relative; give a known length with build --scale-anchor"
 
 
 def _vertical_text(info: SourceInfo) -> str:

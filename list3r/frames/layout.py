@@ -50,7 +50,7 @@ class Optics:
     """The distortion is that of OpenCV's fisheye, (k1, k2, k3, k4)."""
     shares_view: bool = False
     """Depth is of the colour camera itself, if at another size; `depth_intrinsics` say otherwise."""
-    said: bool = False
+    by_user: bool = False
     """`intrinsics` are the user's word, not that of a file: a centre far from the middle is taken as it is."""
 
 
@@ -84,8 +84,8 @@ VARIES = 0.003
 
 
 def varies_note(spread: float, carried: bool) -> str:
-    """Return what is said of frames whose focal lengths differ by a share."""
-    what = "every frame is carried to one camera" if carried else "one camera serves all of them"
+    """Return what is by_user of frames whose focal lengths differ by a share."""
+    what = "all frames are resampled to one camera" if carried else "one camera serves all of them"
     return f"focal lengths of frames differ by {100 * spread:.1f} %: {what}"
 
 
@@ -130,7 +130,7 @@ def iter_numbers(path: Path) -> Iterator[list[float]]:
         try:
             row = [float(word) for word in words]
         except ValueError:
-            raise SourceError(f"{path}: line {number} is not numbers; mend or remove it") from None
+            raise SourceError(f"{path}: line {number} is not numbers; fix or remove it") from None
         if row:
             yield row
 
@@ -166,7 +166,7 @@ def _check_lines(path: Path, file: TextIOWrapper) -> None:
         if count > _MOST_LINES:
             raise SourceError(f"{path} has over {_MOST_LINES:,} lines; give a part of it")
         if unended > _LONGEST_LINE:
-            raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it what it says?")
+            raise SourceError(f"{path} has a line of over {_LONGEST_LINE >> 20} MiB; is it damaged?")
         unended = unended if first < 0 else len(block) - 1 - last
     file.seek(0)
 
@@ -209,7 +209,7 @@ def inside(root: Path, name: str, stated_in: Path) -> Path:
     path = root / name
     led = path.name == ".." or path.is_symlink()
     if not (path.resolve().is_relative_to(root.resolve()) if led else _lies_in(path.parent, root)):
-        raise SourceError(f"{stated_in} names {name}, which lies outside of {root}; copy it there or mend the name")
+        raise SourceError(f"{stated_in} names {name}, which lies outside of {root}; copy it there or correct the name")
     return path
 
 
@@ -225,4 +225,4 @@ def read_json(path: Path) -> object:
         return parse_json(read_text(path))
     except ValueError as error:
         where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else str(error)
-        raise SourceError(f"{path} is not JSON that can be read ({where}); mend or remove it") from None
+        raise SourceError(f"{path} is not JSON that can be read ({where}); fix or remove it") from None

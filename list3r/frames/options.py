@@ -96,13 +96,13 @@ class SourceOptions:
 
     def check_fits(self, info: SourceInfo) -> None:
         """Raise `OptionError` for what is said of a depth camera that the source has not got."""
-        said = {
+        options = {
             "--depth-scale": self.depth_scale is not None,
             "--depth-intrinsics": self.depth_intrinsics is not None,
             "--depth-to-color": self.T_color_depth is not None,
             "--registered": self.registered,
         }
-        given = [option for option, is_given in said.items() if is_given]
+        given = [option for option, is_given in options.items() if is_given]
         if given and not info.has_depth:
             raise OptionError(f"{info.path} has no depth; leave out {' and '.join(given)}")
 
@@ -184,7 +184,7 @@ def check_rigid(matrix: NDArray[np.float64], name: str = "transform") -> NDArray
 
 
 def parse_numbers(text: str, name: str) -> list[float]:
-    """Numbers parted by commas, semicolons or white space. Raises `OptionError` naming the word that is none."""
+    """Numbers separated by commas, semicolons or white space. Raises `OptionError` naming the word that is none."""
     words = text.replace(",", " ").replace(";", " ").split()
     out = []
     for word in words:

@@ -1,7 +1,7 @@
 """Whether given poses fit what the frames show: depth of one frame, seen from another, must meet its depth.
 
 Recorders differ in the axes of a camera and in which way a pose leads; a wrong guess still runs, and makes a world of
-nonsense. What fits far better in another convention is told apart here from poses that merely drift. So is depth in
+nonsense. What fits far better in another convention is distinguished here from poses that merely drift. So is depth in
 another unit: where the camera moves by known metres, what it sees moves by as many pixels as it is far. Without depth,
 corners that are found again must lie on the lines that the poses leave them. `disagreements` is all of it in words.
 """
@@ -35,7 +35,7 @@ class AgreementSettings:
     """Motion that tells conventions apart, or"""
     least_shift_m: float = 0.08
     stride: int = 6
-    """Every so many-th pixel is compared."""
+    """Spacing of the pixels that are compared."""
     tolerance: float = 0.05
     """Depth that differs by less than this share agrees."""
     least_points: int = 100
@@ -44,11 +44,11 @@ class AgreementSettings:
     epipolar_px: float = 2.0
     """What moved is as far from where its pose lets it be, whatever its depth; matches beyond are false."""
     parallax_px: float = 5.0
-    """What moved by less, as against something far away, tells nothing of its depth."""
+    """What moved by less, as against something far away, says nothing of its depth."""
     least_matches: int = 15
     """Of all pairs together."""
     factor: float = 1.6
-    """Depth that is as many times off is told; a wrong focal length alone makes less."""
+    """Depth that is this many times off is reported; a wrong focal length alone makes less."""
     spread: float = 0.25
     """Six of ten matches must agree on one factor within this share."""
     relief: float = 0.08
@@ -61,9 +61,9 @@ class AgreementSettings:
     """Poses, depth and camera contradict each other where a smaller share agrees: 0.93 and more does of recordings that
     are right or drift, under 0.3 with the camera of another size, 0.63 with one 1.3 times too long (0154)."""
     least_fits: int = 3
-    """Pairs that must tell so."""
+    """Least pairs of frames for that verdict."""
     rigid: float = 0.4
-    """Of the matches of two pictures without depth this share must fit one motion of the camera, or nothing is told."""
+    """Of the matches of two pictures without depth this share must fit one camera motion, or there is no verdict."""
     good_lines: float = 0.5
     """As `good`, of corners near the lines that poses leave them; some matches are always false."""
     fits_lines: float = 0.15
@@ -72,20 +72,20 @@ class AgreementSettings:
 
 CONVENTIONS = {
     "as they are read": lambda T: T,
-    "with the camera's y and z turned round (OpenGL against OpenCV)": lambda T: T @ OPENGL_TO_OPENCV,
+    "with the camera's y and z flipped (OpenGL instead of OpenCV axes)": lambda T: T @ OPENGL_TO_OPENCV,
     "inverted (world to camera)": np.linalg.inv,
-    "inverted and turned round (world to camera, OpenGL)": lambda T: np.linalg.inv(T) @ OPENGL_TO_OPENCV,
+    "inverted and flipped (world to camera, OpenGL axes)": lambda T: np.linalg.inv(T) @ OPENGL_TO_OPENCV,
 }
-"""What a pose may have been meant as; the first is what the reader makes of it."""
+"""Conventions in which a pose may have been written; the first is the one that the reader assumes."""
 
 
 Pair = tuple[Frame, Frame]
 
 
 def disagreements(source: FrameSource, settings: AgreementSettings | None = None) -> tuple[str, ...]:
-    """Return how given poses, depth and camera contradict each other, a sentence each; nothing where they agree.
+    """Return how given poses, depth and camera contradict each other, a sentence each; nothing if they agree.
 
-    Nothing, too, where it cannot be told: without poses or motion, or where the frames show too little.
+    Nothing, too, if it cannot be decided: without poses or motion, or if the frames show too little.
     """
     s, info = settings or AgreementSettings(), source.info
     if not info.has_poses or info.camera is None:
@@ -96,8 +96,8 @@ def disagreements(source: FrameSource, settings: AgreementSettings | None = None
     if found is not None:
         what = "depth" if info.has_depth else "pictures"
         return (
-            f"the poses do not fit the {what} as they are read, but do {found}: whoever wrote them meant another "
-            "convention",
+            f"the given poses do not fit the {what}, but would fit {found}: the recording uses another convention than "
+            "its format",
         )
     factor = _factor(source, pairs, s)
     if factor is not None:
@@ -107,31 +107,20 @@ def disagreements(source: FrameSource, settings: AgreementSettings | None = None
 
 
 def _misfit(shares: list[float], has_depth: bool, s: AgreementSettings) -> tuple[str, ...]:
-    """Return what to say of poses that fit in no convention."""
+    """Return the message about poses that fit in no convention."""
     least = s.fits if has_depth else s.fits_lines * s.good / s.good_lines
     if len(shares) < s.least_fits or float(np.median(shares)) >= least:
         return ()
     if not has_depth:
         return (
-            "hardly a corner lies in one picture where the given poses let it be by another: poses or the camera's "
-            "intrinsics are not of these pictures",
+            "hardly any matched corners of two pictures agree with the given poses: the poses or the camera's "
+            "intrinsics do not belong to these pictures",
         )
     return (
-        f"of the depth of one frame, seen from another by the given poses, {100 * np.median(shares):.0f} % meets the "
-        "depth there (of recordings that fit, over 90 %): poses, depth or the camera's intrinsics are not of this "
-        "recording",
+        f"only {100 * np.median(shares):.0f} % of the depth of one frame, projected into another by the given poses, "
+        "agrees with the depth there (over 90 % in a sound recording): poses, depth or the camera's intrinsics do not "
+        "belong to this recording",
     )
-
-
-def wrong_convention(source: FrameSource, settings: AgreementSettings | None = None) -> str | None:
-    """Return in which convention the poses of a source fit what it shows, where that is not the one they are read in.
-
-    None where they fit, or where it cannot be told: without motion, or when nothing fits.
-    """
-    s, info = settings or AgreementSettings(), source.info
-    if not info.has_poses or info.camera is None:
-        return None
-    return _best(_shares(_pairs(source, s), info.camera, s), s)
 
 
 def _shares(pairs: list[Pair], camera: Camera, s: AgreementSettings) -> dict[str, list[float]]:
@@ -180,16 +169,6 @@ def _on_lines(
     return float((off * camera.fx < s.epipolar_px).mean()) * s.good / s.good_lines
 
 
-def depth_factor(source: FrameSource, settings: AgreementSettings | None = None) -> float | None:
-    """Return what depth must be multiplied by for pixels to move as the given poses say, where that is far from 1.
-
-    Infinite where depth falls with what they say, as disparity does. None where it is near 1, or where it cannot be
-    told: without depth, metric poses or motion, or where matches disagree.
-    """
-    s = settings or AgreementSettings()
-    return _factor(source, _pairs(source, s), s)
-
-
 def _factor(source: FrameSource, pairs: list[Pair], s: AgreementSettings) -> float | None:
     info = source.info
     if not (info.has_depth and info.has_poses and info.camera is not None and info.poses_metric):
@@ -219,10 +198,10 @@ def _factors(a: Frame, b: Frame, camera: Camera, s: AgreementSettings) -> NDArra
     line = np.cross(t, turned)
     off = np.abs((q * line).sum(axis=1)) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
     moved = q[:, :2] - turned[:, :2] / np.maximum(turned[:, 2:], 1e-6)
-    told = (off * camera.fx < s.epipolar_px) & (np.linalg.norm(moved, axis=1) * camera.fx > s.parallax_px) & (z > 0)
-    across = np.cross(q[told], turned[told])
-    factors: NDArray[np.float64] = -(across * np.cross(q[told], t)).sum(axis=1) / (z[told] * (across**2).sum(axis=1))
-    return np.stack([z[told], factors])
+    sure = (off * camera.fx < s.epipolar_px) & (np.linalg.norm(moved, axis=1) * camera.fx > s.parallax_px) & (z > 0)
+    across = np.cross(q[sure], turned[sure])
+    factors: NDArray[np.float64] = -(across * np.cross(q[sure], t)).sum(axis=1) / (z[sure] * (across**2).sum(axis=1))
+    return np.stack([z[sure], factors])
 
 
 def _falls(stated: NDArray[np.float64], meant: NDArray[np.float64], s: AgreementSettings) -> bool:
@@ -256,14 +235,13 @@ def _rays(xy: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
 
 
 def _factor_text(factor: float, units: float | None) -> str:
-    """Return what to say of depth in another unit than its poses."""
+    """Return the message about depth in another unit than its poses."""
     if np.isinf(factor):
-        return "depth grows where the motion of what is seen says that things are nearer: is it disparity (1 / depth)?"
-    how = f"{factor:.2g} times as far away" if factor > 1 else f"{1 / factor:.2g} times as near"
-    fix = "" if units is None else f": --depth-scale {float(f'{units / factor:.2g}'):g} would fit, it is {units:g}"
+        return "depth is larger where the motion in the pictures shows nearer things: is it disparity (1 / depth)?"
+    fix = "" if units is None else f"; try --depth-scale {float(f'{units / factor:.2g}'):g} instead of {units:g}"
     return (
-        f"between the given poses the motion of what is seen is that of things {how} as depth says{fix} (where the "
-        "poses are in metres)"
+        f"by the given poses, the motion in the pictures fits {factor:.2g} times the given depth{fix} (if the poses "
+        "are in metres)"
     )
 
 

@@ -1,4 +1,4 @@
-"""Which frames of a source are handed out: from when to when, every how many, and which one of each so many."""
+"""Which frames of a source are handed out: from when to when, every N-th, and which one of each group."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def select(
     """Return the frames that the options leave of a source.
 
     `times_s` (F,) are the frames' times, ascending, from the source's `clock` or made up from a frame rate. With a
-    clock, `fps` thins the frames out to so many a second. Of a thinned video the sharpest frames are taken unless the
+    clock, `fps` thins the frames out to this many a second. Of a thinned video the sharpest frames are taken unless the
     options say otherwise. Raises `OptionError` when no frame is left.
     """
     count = len(times_s)
@@ -70,12 +70,12 @@ def select(
 
 def _range_text(options: SourceOptions) -> str:
     """Return the options that say from where to where, in the user's words."""
-    said = []
+    parts = []
     if options.start is not None or options.stop is not None:
-        said.append(f"frames {'' if options.start is None else options.start}:{options.stop or ''}")
+        parts.append(f"frames {'' if options.start is None else options.start}:{options.stop or ''}")
     if options.start_s is not None or options.end_s is not None:
-        said.append(f"seconds {options.start_s or 0:g} to {'the end' if options.end_s is None else options.end_s}")
-    return " and ".join(said) or "the options"
+        parts.append(f"seconds {options.start_s or 0:g} to {'the end' if options.end_s is None else options.end_s}")
+    return " and ".join(parts) or "the options"
 
 
 def sharpness(gray: NDArray[np.uint8]) -> float:

@@ -98,14 +98,14 @@ def open_source(path: str | Path, options: SourceOptions | None = None, listing:
             return lerobot.LeRobotSource(root, options)
         if options.kind in ("auto", "aria") and aria.is_recording(root):
             if not os.access(root, os.R_OK) or (root.is_file() and root.stat().st_size == 0):
-                raise SourceError(f"{root} is empty or may not be read; check the copy and its permissions")
+                raise SourceError(f"{root} is empty or cannot be read; check the copy and its permissions")
             return aria.AriaSource(root, options)
         if options.topics or options.episode is not None:
-            name = "--topics is of ROS recordings and" if options.topics else "--episode is of"
-            raise OptionError(f"{name} data sets of LeRobot, and {root} is none; leave it out")
+            name = "--topics is for ROS recordings and" if options.topics else "--episode is for"
+            raise OptionError(f"{name} LeRobot data sets, and {root} is none; leave it out")
         return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
-        raise SourceError(f"{error.filename or root} may not be read; check its permissions") from None
+        raise SourceError(f"{error.filename or root} cannot be read; check its permissions") from None
 
 
 def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
@@ -114,7 +114,7 @@ def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
         if not path.is_file() or path.suffix.lower() in (*IMAGE_ENDINGS, *FILES):
             raise SourceError(f"{path} is not a video file; only video files of one recording can be given together")
         if not os.access(path, os.R_OK) or path.stat().st_size == 0:
-            raise SourceError(f"{path} is empty or may not be read; check the copy and its permissions")
+            raise SourceError(f"{path} is empty or cannot be read; check the copy and its permissions")
     from list3r.frames.readers.joined import JoinedVideos
 
     return JoinedVideos(paths, options)
@@ -130,13 +130,13 @@ def require_camera(info: SourceInfo) -> Camera:
 def check_bad_share(bad: int, total: int, reason: str = "") -> None:
     """Raises `SourceError` when more than half of the frames could not be used, with the `reason` of one of them."""
     if bad * 2 > total:
-        said = f" ({reason})" if reason else ""
-        raise SourceError(f"{bad} of {total} frames cannot be used{said}; is the copy of the source complete?")
+        why = f" ({reason})" if reason else ""
+        raise SourceError(f"{bad} of {total} frames cannot be used{why}; is the copy of the source complete?")
 
 
 def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     if not os.access(root, os.R_OK | os.X_OK):
-        raise SourceError(f"{root} may not be read; check its permissions")
+        raise SourceError(f"{root} cannot be read; check its permissions")
     if not any(root.iterdir()):
         raise SourceError(f"{root} is an empty folder; {_WANTED}")
     if options.kind == "video":
@@ -168,8 +168,8 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     inside = next((p for p in folders if images.find(p, options)), None)
     if inside is not None and options.kind in ("auto", "images"):
         raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
-    said = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
-    raise SourceError(f"{root} has {said}; {_WANTED}")
+    problem = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
+    raise SourceError(f"{root} has {problem}; {_WANTED}")
 
 
 def _check_nothing_ignored(root: Path, kind: str, options: SourceOptions) -> None:
@@ -195,16 +195,16 @@ def _pictures_to_convert(root: Path) -> str | None:
 
 def _open_file(path: Path, options: SourceOptions) -> FrameSource:
     if not os.access(path, os.R_OK):
-        raise SourceError(f"{path} may not be read; check its permissions")
+        raise SourceError(f"{path} cannot be read; check its permissions")
     kind, find = FILES.get(path.suffix.lower(), ("video", None))
     if options.kind not in ("auto", kind):
         raise SourceError(f"{path} is a file, but the {options.kind} layout is a folder; name the folder")
     if path.suffix.lower() in IMAGE_ENDINGS:
         raise SourceError(f"{path} is one image; name the folder of images or a video")
     if path.is_file() and path.stat().st_size == 0:
-        raise SourceError(f"{path} is empty (0 bytes); was the upload finished?")
+        raise SourceError(f"{path} is empty (0 bytes); is the upload complete?")
     if not path.is_file():
-        raise SourceError(f"{path} is no ordinary file; {_WANTED}")
+        raise SourceError(f"{path} is not a regular file; {_WANTED}")
     if find is not None:
         return FolderSource(path, find(path, options), options)
     if options.kind == "auto" and stray.is_recording(path.parent) and path.name == "rgb.mp4":

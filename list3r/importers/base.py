@@ -34,12 +34,12 @@ def imported_as(store: Store, instance_id: int) -> dict[str, Any] | None:
 
     None for an instance that was built.
     """
-    told = store.facts[IMPORTED]
-    if told is None:
+    stored = store.facts[IMPORTED]
+    if stored is None:
         return None
     first = min(chunk.chunk_id for chunk in store.chunks.all())  # the map itself; later ones are of videos
-    names = [told["names"][o.local_id] for o in store.observations.of(instance_id) if o.chunk_id == first]
-    return {"format": told["format"], "path": told["path"], "names": names} if names else None
+    names = [stored["names"][o.local_id] for o in store.observations.of(instance_id) if o.chunk_id == first]
+    return {"format": stored["format"], "path": stored["path"], "names": names} if names else None
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def read_json_file(path: Path) -> Any:
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check the file") from None
     except ValueError as error:
-        raise SourceError(f"{path} is not JSON that can be read ({error}); was it copied whole?") from None
+        raise SourceError(f"{path} is not JSON that can be read ({error}); is the copy complete?") from None
 
 
 def box_surface(box: OrientedBox) -> NDArray[np.float32]:
@@ -96,5 +96,5 @@ def vector(value: object, where: str) -> NDArray[np.float64]:
     except (TypeError, ValueError):
         out = np.zeros(0)
     if out.shape != (3,) or not np.isfinite(out).all():
-        raise SourceError(f"{where} is not three numbers; mend or remove it")
+        raise SourceError(f"{where} is not three numbers; fix or remove it")
     return out

@@ -14,7 +14,7 @@ import numpy as np
 
 from list3r.frames.decoding.decode import read_raw_depth
 from list3r.importers.base import ImportedMap, ImportedThing
-from list3r.memory.errors import FrameError, SourceError
+from list3r.memory.errors import FrameError, SourceError, first_line
 
 _LEAST_POINTS = 10
 
@@ -32,7 +32,7 @@ def read(path: Path) -> ImportedMap:
     try:
         found: Any = Reconstruction(str(model))
     except Exception as error:
-        raise SourceError(f"{model} cannot be read as a model of COLMAP: {str(error).splitlines()[0]}") from None
+        raise SourceError(f"{model} cannot be read as a model of COLMAP: {first_line(error)}") from None
     votes: dict[int, Counter[int]] = {}
     unmasked = 0
     for image in found.images.values():

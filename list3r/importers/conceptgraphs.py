@@ -54,7 +54,7 @@ def _file(path: Path) -> Path | None:
 
 def _thing(file: Path, key: str, entry: object) -> ImportedThing:
     if not isinstance(entry, Mapping):
-        raise SourceError(f"{file}: {key} is not an object; mend or remove it")
+        raise SourceError(f"{file}: {key} is not an object; fix or remove it")
     center = vector(entry.get("bbox_center"), f"{file}: bbox_center of {key}")
     size = vector(entry.get("bbox_extent"), f"{file}: bbox_extent of {key}")
     points = box_surface(OrientedBox(center, np.maximum(np.abs(size), 0.01), np.eye(3)))

@@ -36,7 +36,7 @@ def read(path: Path) -> ImportedMap:
 def _thing(file: Path) -> ImportedThing | None:
     content = read_json_file(file)
     if not isinstance(content, dict):
-        raise SourceError(f"{file} is not an object of HOV-SG; mend or remove it")
+        raise SourceError(f"{file} is not an object of HOV-SG; fix or remove it")
     cloud = file.with_suffix(".ply")
     if not cloud.is_file():
         return None

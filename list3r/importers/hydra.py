@@ -47,7 +47,7 @@ def read(path: Path) -> ImportedMap:
         notes.append("the file holds no mesh: objects are boxes")
     others = len(content["nodes"]) - len(nodes)
     if others:
-        notes.append(f"{others} nodes that are no objects (places, rooms, agents) were not read")
+        notes.append(f"{others} nodes that are not objects (places, rooms, agents) were not read")
     return ImportedMap("hydra", things, notes=tuple(notes))
 
 
@@ -82,50 +82,50 @@ def _mesh(content: Mapping[str, Any]) -> NDArray[np.float32] | None:
 def _thing(
     path: Path, node: Mapping[str, Any], labels: Mapping[int, str], mesh: NDArray[np.float32] | None
 ) -> ImportedThing | None:
-    said, number = node["attributes"], node.get("id")
+    attributes, number = node["attributes"], node.get("id")
     where = f"{path}: node {number}"
-    label = _label(said, labels)
-    box = _box(said.get("bounding_box"), where)
-    points = _points(said, mesh)
+    label = _label(attributes, labels)
+    box = _box(attributes.get("bounding_box"), where)
+    points = _points(attributes, mesh)
     if points is None and box is None:
         return None
     return ImportedThing(symbol(number), label, box_surface(box) if points is None else points)  # type: ignore[arg-type]
 
 
-def _label(said: Mapping[str, Any], labels: Mapping[int, str]) -> str | None:
+def _label(attributes: Mapping[str, Any], labels: Mapping[int, str]) -> str | None:
     """Return the name of a thing or of its class; "class 7" where only the number is said."""
-    name, number = said.get("name"), said.get("semantic_label")
+    name, number = attributes.get("name"), attributes.get("semantic_label")
     if isinstance(name, str) and name and not name.endswith(")"):
         return name
     known = isinstance(number, int) and 0 < number < _NO_LABEL
     return labels.get(number, f"class {number}") if known and isinstance(number, int) else None
 
 
-def _points(said: Mapping[str, Any], mesh: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-    rows = said.get("mesh_connections")
+def _points(attributes: Mapping[str, Any], mesh: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+    rows = attributes.get("mesh_connections")
     if mesh is None or not isinstance(rows, list):
         return None
     known = [r for r in rows if isinstance(r, int) and 0 <= r < len(mesh)]
     return mesh[known] if len(known) >= _LEAST_POINTS else None
 
 
-def _box(said: object, where: str) -> OrientedBox | None:
+def _box(box: object, where: str) -> OrientedBox | None:
     """Return the bounding box, None for one that the graph calls invalid. Raises `SourceError`."""
-    if not isinstance(said, dict) or said.get("type") in (None, "INVALID"):
+    if not isinstance(box, dict) or box.get("type") in (None, "INVALID"):
         return None
-    center = vector(said.get("world_P_center"), f"{where}: world_P_center")
-    if "dimensions" in said:
-        size = vector(said["dimensions"], f"{where}: dimensions")
+    center = vector(box.get("world_P_center"), f"{where}: world_P_center")
+    if "dimensions" in box:
+        size = vector(box["dimensions"], f"{where}: dimensions")
     else:
-        low, high = (vector(said.get(k), f"{where}: {k}") for k in ("min", "max"))
+        low, high = (vector(box.get(k), f"{where}: {k}") for k in ("min", "max"))
         size = high - low
-    turn = said.get("world_R_center")
+    turn = box.get("world_R_center")
     rotation = np.eye(3)
-    if said["type"] != "AABB" and isinstance(turn, dict):
+    if box["type"] != "AABB" and isinstance(turn, dict):
         try:
             rotation = Rotation.from_quat([float(turn[k]) for k in "xyzw"]).as_matrix()
         except (KeyError, TypeError, ValueError):
-            raise SourceError(f"{where}: world_R_center is not a rotation; mend or remove it") from None
+            raise SourceError(f"{where}: world_R_center is not a rotation; fix or remove it") from None
     return OrientedBox(center, np.maximum(np.abs(size), 0.01), rotation)
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from list3r import __version__
 from list3r.importers.base import GRAY, IMPORTED, ImportedMap, ImportedThing
 from list3r.importers.registry import read_map
-from list3r.importers.standing import doubt_of_up
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.importers.up_axis import up_axis_notes
+from list3r.memory.errors import MemoryFileError, OptionError, check_choice
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary, MaskTrack, Support
@@ -54,8 +54,7 @@ def import_map(path: str | Path, memory: str | Path, *, kind: str = "auto", up: 
     Raises `SourceError` for what is no such map, `OptionError`, and `MemoryFileError` for a memory that exists.
     """
     source, target = Path(path).expanduser(), Path(memory)
-    if up not in _TURNS:
-        raise OptionError(f"--up {up} is not known; choose {', '.join(_TURNS)}")
+    check_choice("--up", up, _TURNS)
     if target.exists():
         raise MemoryFileError(taken(target))
     found = read_map(source, kind)
@@ -103,9 +102,9 @@ def _write(store: Store, source: Path, found: ImportedMap, up: str) -> ImportRep
     finish_session(store, session, settings.association)
     names = {t.name for t in found.things}
     ids = {found.things[o.local_id].name: o.instance_id for o in store.observations.all()}
-    notes = (*found.notes, *doubt_of_up([t.points for t in found.things], up))
+    notes = (*found.notes, *up_axis_notes([t.points for t in found.things], up))
     if len(names) < len(found.things):
-        notes = (*notes, "several things of the map have one name")
+        notes = (*notes, "several things of the map have the same name")
     left = len(found.things) - len(store.observations.all())
     if left:
         notes = (*notes, f"{left} things of the map became no instance of their own")

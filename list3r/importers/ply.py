@@ -28,7 +28,7 @@ def read_vertices(path: Path) -> dict[str, NDArray[np.float64]]:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check the file") from None
     head, found, _ = data[:_MOST_HEADER].partition(b"end_header")
     if not data.startswith(b"ply") or not found:
-        raise SourceError(f"{path} is not a PLY file; was it copied whole?")
+        raise SourceError(f"{path} is not a PLY file; is the copy complete?")
     start = len(head) + len(found) + (2 if data[len(head) + len(found) :][:2] == b"\r\n" else 1)
     order, count, fields = _header(path, head.decode("ascii", "replace"))
     kind = np.dtype([(name, order + code) for name, code in fields])
@@ -36,7 +36,7 @@ def read_vertices(path: Path) -> dict[str, NDArray[np.float64]]:
     if text:
         return _text_rows(path, data[start:], count, [name for name, _ in fields])
     if len(data) - start < count * kind.itemsize:
-        raise SourceError(f"{path} ends before its {count} vertices; was it copied whole?")
+        raise SourceError(f"{path} ends before its {count} vertices; is the copy complete?")
     rows = np.frombuffer(data, kind, count, start)
     return {name: rows[name].astype(np.float64) for name, _ in fields}
 
@@ -77,5 +77,5 @@ def _text_rows(path: Path, body: bytes, count: int, names: list[str]) -> dict[st
     except ValueError:
         table = np.zeros((0, 0))
     if table.shape != (count, len(names)):
-        raise SourceError(f"{path} ends before its {count} vertices, or has lines that are no numbers")
+        raise SourceError(f"{path} ends before its {count} vertices, or has lines that are not numbers")
     return dict(zip(names, table.T, strict=True))

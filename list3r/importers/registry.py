@@ -7,7 +7,7 @@ from pathlib import Path
 
 from list3r.importers import colmap_masks, conceptgraphs, hovsg, hydra, labelled_cloud
 from list3r.importers.base import ImportedMap
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import SourceError, check_choice
 
 FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], ImportedMap]]] = {
     "conceptgraphs": (conceptgraphs.matches, conceptgraphs.read),
@@ -21,8 +21,7 @@ FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], ImportedMap]]]
 
 def read_map(path: Path, name: str = "auto") -> ImportedMap:
     """Return the map at a path. Raises `SourceError` for none, `OptionError` for a format that is not known."""
-    if name not in ("auto", *FORMATS):
-        raise OptionError(f"--format {name} is not known; choose auto, {', '.join(FORMATS)}")
+    check_choice("--format", name, ("auto", *FORMATS))
     if not path.exists():
         raise SourceError(f"{path} does not exist; name a map of {', '.join(FORMATS)}")
     for kind, (matches, read) in FORMATS.items():

@@ -39,7 +39,7 @@ class Edit:
     kind: str
     """merge, split, label, delete, scale, undo."""
     parts: tuple[tuple[Key, ...], ...]
-    """The local instances it speaks of: the two instances of a merge, the two parts of a split, else one instance."""
+    """The local instances concerned: the two instances of a merge, the two parts of a split, else one instance."""
     through: int
     """The last chunk then."""
     before: tuple[tuple[int, str | None, tuple[Key, ...]], ...]
@@ -258,13 +258,13 @@ class ConstraintCheck:
     def objection(self, a: Key, b: Key) -> str:
         """Return why the groups of two local instances must stay apart, or nothing."""
         if self._links.forbids(a, b):
-            return "an operator parted them"
+            return "an operator split them"
         if not self._deletions:
             return ""
         left, right = self._links.members(a), self._links.members(b)
         sides = ((left, right), (right, left))
-        parted = (not d.keys.isdisjoint(x) and d.outside(y) for d in self._deletions for x, y in sides)
-        return "an operator deleted one of them, and not the other" if any(parted) else ""
+        separated = (not d.keys.isdisjoint(x) and d.outside(y) for d in self._deletions for x, y in sides)
+        return "an operator deleted one of them, and not the other" if any(separated) else ""
 
     def join(self, a: Key, b: Key) -> None:
         """Take in that two groups, named by any member, have joined."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 
 class List3rError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it in one line and exits with 2."""
+    """Base of every error that the user can fix; the command line prints it in one line and exits with 2."""
 
 
 class SourceError(List3rError):
@@ -54,6 +54,25 @@ class ExportError(List3rError):
     """An export that cannot be written."""
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says, or its kind where it says nothing."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = " ".join(lines[:2]) if lines and lines[0].endswith(":") else (lines[0] if lines else type(error).__name__)
+    return text[:240]
+
+
+def check_choice(name: str, value: str, known: Collection[str]) -> None:
+    """Raise `OptionError` for a value that is none of the known ones."""
+    if value not in known:
+        raise OptionError(f"{name} {value} is not known; choose one of: {', '.join(known)}")
+
+
+def check_share(name: str, value: float) -> None:
+    """Raise `OptionError` for a share that is not in [0, 1]."""
+    if not 0.0 <= value <= 1.0:
+        raise OptionError(f"{name} {value:g} must lie between 0 and 1")
+
+
 EXTRA_OF_PACKAGE = {
     "cv2": "build",
     "numba": "build",
@@ -95,4 +114,4 @@ def naming_extras() -> Iterator[None]:
         if module not in EXTRA_OF_PACKAGE:
             raise
         install = f"pip install 'list3r[{EXTRA_OF_PACKAGE[module]}]'"
-        raise MissingPackageError(f"this takes {module}, which is not installed: {install}") from None
+        raise MissingPackageError(f"this needs {module}, which is not installed: {install}") from None

@@ -7,6 +7,7 @@ frame b to frame a, ``p_a = S_a_b @ p_b``; in a product neighbouring letters can
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,6 +148,20 @@ class Sim3:
         p = np.asarray(points, dtype=np.float64)
         turned = p @ np.swapaxes(self.rotation, -1, -2)
         return np.asarray(np.asarray(self.scale)[..., None, None] * turned + self.translation[..., None, :])
+
+
+def stack(poses: Sequence[Sim3]) -> Sim3:
+    """Return one batched similarity of many. Shape (K,)."""
+    return Sim3(
+        np.array([float(p.scale) for p in poses]),
+        np.array([p.rotation for p in poses]).reshape(-1, 3, 3),
+        np.array([p.translation for p in poses]).reshape(-1, 3),
+    )
+
+
+def take(poses: Sim3, rows: int | NDArray[np.int64]) -> Sim3:
+    """Return one or some of a batch."""
+    return Sim3(poses.scale[rows], poses.rotation[rows], poses.translation[rows])
 
 
 def umeyama(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None, *, with_scale: bool) -> Sim3:

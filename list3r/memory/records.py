@@ -107,7 +107,7 @@ class LocalLibrary:
     feature_space: str
     """Name of the embedding space of the features, `model@revision/dim`."""
     scraps: tuple[LocalInstance, ...] = ()
-    """What is too seldom one thing and all of it to be listed; `stability` is that probability. Seen in anchors alone,
+    """What is too unlikely to be one whole thing to be listed; `stability` is that probability. Seen in anchors alone,
     without part in anything that is derived from the instances."""
 
 

@@ -155,7 +155,7 @@ def check_weights(path: Path) -> None:
         if file.suffix == ".safetensors":
             read_header(file)
         elif file.stat().st_size < 1024:
-            raise OptionError(f"{file} is {file.stat().st_size} bytes long and no checkpoint; fetch it again")
+            raise OptionError(f"{file} is {file.stat().st_size} bytes long and not a checkpoint; fetch it again")
 
 
 def read_header(file: Path) -> dict[str, Any]:

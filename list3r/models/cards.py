@@ -53,7 +53,7 @@ class MemoryFigures:
     """Who measured it, on what."""
 
     def needed_mb(self, pictures: int, pixels: int) -> float:
-        """Memory of one pass over so many pictures of `pixels` pixels."""
+        """Memory of one pass over this many pictures of `pixels` pixels."""
         return self.fixed_mb + self.per_megapixel_mb * pictures * pixels / 1e6
 
 

@@ -85,7 +85,7 @@ class MemoryBudget:
         self._limit = max(1, min(self._limit or pictures, pictures // 2))
 
     def measured(self, pictures: int, peak_mb: float, weights_mb: float) -> None:
-        """A pass over so many took `peak_mb` in all, `weights_mb` of it for the weights: correct the figures by it.
+        """A pass over this many took `peak_mb` in all, `weights_mb` of it for the weights: correct the figures by it.
 
         A pass over a handful of pictures says too little of a long one, so it is not believed.
         """

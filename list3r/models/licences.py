@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_choice
 from list3r.models.cache import split_name
 from list3r.models.cards import OTHER, Licence, ModelCard, Weights, find_weights
 
@@ -17,8 +17,7 @@ DEFAULT_PROFILE = "research"
 
 def check_profile(profile: str) -> None:
     """Raise `OptionError` for a profile that is not known."""
-    if profile not in PROFILES:
-        raise OptionError(f"--licence {profile} is not known; choose {', '.join(PROFILES)}")
+    check_choice("--licence", profile, PROFILES)
 
 
 def objection(card: ModelCard, weights: Weights | None, profile: str) -> str | None:
@@ -73,11 +72,11 @@ def terms(card: ModelCard, weights: Weights | None) -> str:
     """Return what a user should know before using a model commercially; empty where there is nothing to say."""
     if weights is None:
         return ""
-    said = [
+    conditions = [
         f"{what} {licence.name}"
         for what, licence in (("code", card.code), ("weights", weights.licence))
         if licence.kind != "permissive"
     ]
     if weights.gated:
-        said.append("gated")
-    return f"{card.name}: {', '.join(said)}" if said else ""
+        conditions.append("gated")
+    return f"{card.name}: {', '.join(conditions)}" if conditions else ""

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_choice, first_line
 from list3r.models.cache import CONFIG, check_weights
 from list3r.models.device import out_of_memory_reported
-from list3r.models.upstream import first_line
 
 if TYPE_CHECKING:
     import torch
@@ -44,8 +43,7 @@ def load_named(
     `exact` keeps it in float32 everywhere, for networks that half precision breaks.
     Raises `OptionError` as `pick_device` and `load_pretrained` do, and for a name that is none of the kinds.
     """
-    if name not in kinds:
-        raise OptionError(f"--{option} {name} is not known; choose one of {', '.join(kinds)}")
+    check_choice(f"--{option}", name, kinds)
     chosen = pick_device(device)
     return load_pretrained(kinds[name], folder, chosen, exact=exact), chosen
 

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, first_line
 from list3r.models.cache import SINGLE_FILES, check_weights
 from list3r.models.cards import ModelCard
 from list3r.models.device import out_of_memory_reported
@@ -115,10 +115,3 @@ def _check_complete(model: Any, names: set[str], path: Path) -> None:
             f"{path} holds other weights than {type(model).__name__} needs: {len(missing)} of {len(wanted)} tensors "
             f"are missing, first {missing[0]}"
         )
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of what an error says, or its kind where it says nothing."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    text = " ".join(lines[:2]) if lines and lines[0].endswith(":") else (lines[0] if lines else type(error).__name__)
-    return text[:240]

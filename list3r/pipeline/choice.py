@@ -95,7 +95,7 @@ def look_doubts(settings: BuildSettings, first: BuildSettings) -> list[str]:
     if settings.frame_look == first.frame_look:
         return []
     return [
-        f"this memory finds places again by {first.features}; without --features {first.features} a session is "
+        f"this memory recognises places by {first.features}; without --features {first.features} a session is "
         "placed by its things alone"
     ]
 

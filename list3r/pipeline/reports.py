@@ -161,8 +161,8 @@ def _update_notes(chunks: int, placed: int, held: int, lost: int, frames: int) -
             "no place in this video was recognised: it is kept apart, in a frame of its own, and is joined "
             "when a later session connects the two"
             if not held
-            else "a place in this video seems known, but no second relation agrees on how the two worlds lie: it "
-            "is kept apart until another does, or a later session connects the two"
+            else "a place in this video was recognised by a single relation only: it is kept apart until a second one "
+            "confirms it, or a later session connects the two"
         )
     elif placed < chunks:
         notes.append(f"{chunks - placed} of {chunks} chunks could not be placed; they are kept apart")

@@ -123,7 +123,7 @@ class RunOptions:
         ),
     )
     workers: int | None = field(
-        default=None, metadata=option("Worker processes; 0: work in this process; default: the cores, at most 4.", "N")
+        default=None, metadata=option("Worker processes; 0: work in this process; default: one a core, at most 4.", "N")
     )
     engine: str = field(
         default="local",

@@ -388,7 +388,7 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
 
 def _check_prior(info: SourceInfo, reconstruction: str) -> None:
     """Raise `OptionError` where poses that are given cannot be corrected, with the reason."""
-    otherwise = "use --poses given, which takes them as they are, or estimate, which does without them"
+    otherwise = "use --poses given, which uses them as they are, or estimate, which does not use them"
     if not info.has_depth:
         raise OptionError(
             f"--poses prior corrects poses by sensor depth, from one frame to the next, and {info.path} has none; "
@@ -406,7 +406,7 @@ def _check_prior(info: SourceInfo, reconstruction: str) -> None:
 def check_agreement(source: FrameSource) -> None:
     """Raise `SourceError` where given poses contradict what the frames show."""
     for found in disagreements(source):
-        raise SourceError(f"{source.info.path}: {found}; mend that, or use --poses estimate, which does without poses")
+        raise SourceError(f"{source.info.path}: {found}; fix that, or use --poses estimate, which needs no poses")
 
 
 def with_weights(settings: BuildSettings, licence: str = DEFAULT_PROFILE) -> BuildSettings:

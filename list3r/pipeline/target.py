@@ -52,7 +52,7 @@ def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume
     if path.is_dir():
         raise MemoryFileError(f"{path} is a folder; name a file for the memory, such as {path / 'memory.l3r'}")
     if path.exists() and not path.is_file():
-        raise MemoryFileError(f"{path} is a device or pipe, no ordinary file; name another file for the memory")
+        raise MemoryFileError(f"{path} is a device or pipe, not a regular file; name another file for the memory")
     if path.exists() and path.stat().st_size == 0:
         path.unlink()
     aside = _aside(path)

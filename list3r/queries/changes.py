@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import check_choice, check_share
 from list3r.memory.records import ChangeEvent, Instance
 from list3r.memory.store.store import Store
 
@@ -49,13 +49,11 @@ def changes(
     Within a session by kind, the surest first. A thing that no frame could look at has no event. Raises `OptionError`
     for a session or a kind that there is not.
     """
-    sessions = [s.session_id for s in store.sessions.all()]
-    if since is not None and since not in sessions:
-        raise OptionError(f"{store.path} has no session {since}; it has {', '.join(map(str, sessions))}")
-    if wrong := [k for k in kinds if k not in KINDS]:
-        raise OptionError(f"kind of change {wrong[0]!r} is not known; choose one of: {', '.join(KINDS)}")
-    if not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    if since is not None:
+        store.sessions.check(since)
+    for kind in kinds:
+        check_choice("kind of change", kind, KINDS)
+    check_share("min_confidence", min_confidence)
     wanted = [
         e
         for e in store.events.all()

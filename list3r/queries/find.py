@@ -74,7 +74,7 @@ def find(
 
 def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
     """Return what words alone name in a large memory, of which only the answers are read; None for all other
-    questions, and where nothing bears the words.
+    questions, and where no instance has the words.
     """
     words, more = phrase.words, (phrase.where, phrase.size, phrase.superlative)
     if not words or any(more) or phrase.instance_id is not None or not is_large(store):
@@ -93,8 +93,8 @@ def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
     store.words.check(best, words, total)
     matches = [Match(i, round(scores[i.id], 4), None, None, named) for i in best]
     equal = sum(score > scores[order[0]] - _EQUAL for score in scores.values())
-    told = [f"{equal} instances match equally well; add words to tell them apart"] if equal > 1 and k > 1 else []
-    return Found(matches, (*gathered.notes, *told), (), len(order))
+    notes = [f"{equal} instances match equally well; add words to tell them apart"] if equal > 1 and k > 1 else []
+    return Found(matches, (*gathered.notes, *notes), (), len(order))
 
 
 # ---------------------------------------------------------------------------------------------- phrases
@@ -142,7 +142,7 @@ def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
 
 
 def _vocabulary(i: Instance) -> dict[str, float]:
-    """Return words that an instance bears, with how well each names it."""
+    """Return words that an instance has, with how well each names it."""
     return vocabulary(i.label, i.structure, i.description, i.color_name)
 
 
@@ -172,7 +172,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
 
 
 def _unknown(search: PhraseSearch, words: Sequence[str]) -> list[str]:
-    """Return words that nothing bears."""
+    """Return words that no instance has."""
     if search.gathered is not None:
         known = search.store.words.known(words)
         return [w for w in words if w not in known]
@@ -229,10 +229,10 @@ def _sized(search: PhraseSearch, found: list[PhraseMatch], phrase: Phrase) -> li
     out = []
     for c in found:
         rank = float(np.mean(edges < _edge(c.instance)) + 0.5 * np.mean(edges == _edge(c.instance)))
-        said = search.vocabulary[c.instance.id].get(size, 0.0)
+        weight = search.vocabulary[c.instance.id].get(size, 0.0)
         fit = 1.0 - rank if high <= 0.5 else rank if low >= 0.5 else 1.0 - 2.0 * abs(rank - 0.5)
-        if said > 0.0 or low <= rank <= high:
-            score = max(said, 0.5 + 0.5 * fit)
+        if weight > 0.0 or low <= rank <= high:
+            score = max(weight, 0.5 + 0.5 * fit)
             why = f"{size}: longest edge {_edge(c.instance):.2f}, {1.0 - rank:.0%} of the others are larger"
             out.append(PhraseMatch(c.instance, c.score * score, (*c.reasons, why)))
     return out

@@ -9,7 +9,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import OptionError, UnknownIdError
+from list3r.memory.errors import OptionError, UnknownIdError, check_choice, check_share
 from list3r.memory.records import BestView, Instance
 from list3r.memory.store.store import Store
 from list3r.queries.finding.words import is_colored, is_named, wanted_words
@@ -91,10 +91,9 @@ class Filters:
     """Only what was seen moving (True), or what was not (False)."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.min_confidence <= 1.0:
-            raise OptionError(f"min_confidence {self.min_confidence} must lie between 0 and 1")
-        if self.state is not None and self.state not in STATES:
-            raise OptionError(f"state {self.state!r} is not known; choose one of: {', '.join(STATES)}")
+        check_share("min_confidence", self.min_confidence)
+        if self.state is not None:
+            check_choice("state", self.state, STATES)
         for words in (self.label, self.color):
             if words is not None:
                 wanted_words(words)
@@ -161,7 +160,7 @@ def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
     if point.shape != (3,) or not np.isfinite(point).all():
         raise OptionError(f"{name} must be three finite numbers x, y, z, not {value!r}")
     if np.abs(point).max() > _FARTHEST:
-        raise OptionError(f"{name} {value!r} lies beyond {_FARTHEST:g}, where distances are no numbers any more")
+        raise OptionError(f"{name} {value!r} is too far away; distances up to {_FARTHEST:g} can be computed")
     return point
 
 

@@ -44,10 +44,10 @@ def nearest(
 ) -> Matches:
     """Find the k instances nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
-    With `words` only things whose label or description bears one of them; with words alone those that they name best,
-    then the surest, without distances. The words must all be found where any thing bears them all. Words that say more
+    With `words` only things whose label or description has one of them; with words alone those that they name best,
+    then the surest, without distances. The words must all be found where any thing has them all. Words that say more
     than names (a relation, a size, an id: "small mug on the table") mean what they mean to `find`. Words that name a
-    kind of structure ("floor", "wall") ask for structure too. Words that nothing bears are compared by the vectors of
+    kind of structure ("floor", "wall") ask for structure too. Words that no instance has are compared by the vectors of
     an `encoder` whose space the memory holds. `max_distance` bounds the distance between
     surfaces. What moves is taken where it was last seen; near an instance only what shares its component answers. For
     the filters see `Filters`. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that
@@ -67,7 +67,7 @@ def nearest(
     if words is None:
         near = _near(store, origin, place, k, max_distance, Filters(**options))
         return Matches(_match(i, distance, "", origin, place) for distance, i in near)
-    from list3r.queries.called import called, names_structure, only_common
+    from list3r.queries.by_words import named_by, names_structure, only_common
 
     options["structure"] = options.get("structure", False) or names_structure(words)
     filters = Filters(**options)
@@ -76,7 +76,7 @@ def nearest(
         near = _near(store, origin, place, k, max_distance, filters)
         return Matches(_match(i, distance, f"named {words}", origin, place) for distance, i in near)
     notes: list[str] = []
-    named = called(store, words, origin, filters, encoder, notes)
+    named = named_by(store, words, origin, filters, encoder, notes)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         best = (Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k])
@@ -153,10 +153,10 @@ def _match(
 ) -> Match:
     """Return an answer, with its distance in words."""
     if origin is not None:
-        offset, whence = i.center - origin.center, f"from #{origin.id}"
+        offset, reference = i.center - origin.center, f"from #{origin.id}"
     else:
         assert place is not None
-        offset, whence = i.center - place, "from the point"
+        offset, reference = i.center - place, "from the point"
     center = math.sqrt(offset.dot(offset))
-    reason = f"surface {surface:.2f}, centre {center:.2f} {whence}" + (f", {named}" if named else "")
+    reason = f"surface {surface:.2f}, centre {center:.2f} {reference}" + (f", {named}" if named else "")
     return Match(i, round(1.0 / (1.0 + surface), 4), surface, center, reason)

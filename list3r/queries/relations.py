@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_choice, check_share
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.relations.settings import RelationSettings
@@ -58,10 +58,9 @@ def relations(
     from a point or a thing, without gravity. Raises `OptionError` for a predicate that does not exist or arguments that
     do not fit, `UnknownIdError` for an id that was never given.
     """
-    if predicate is not None and predicate not in ALL_PREDICATES:
-        raise OptionError(f"predicate {predicate!r} is not known; choose one of: {', '.join(ALL_PREDICATES)}")
-    if not 0.0 <= min_confidence <= 1.0:
-        raise OptionError(f"min_confidence {min_confidence} must lie between 0 and 1")
+    if predicate is not None:
+        check_choice("predicate", predicate, ALL_PREDICATES)
+    check_share("min_confidence", min_confidence)
     if predicate in VIEWPOINT and viewpoint is None:
         raise OptionError(f"{predicate} depends on the viewpoint: name one (--from ID, camera, camera:FRAME or x,y,z)")
     if viewpoint is not None and predicate is not None and predicate not in VIEWPOINT:
@@ -88,9 +87,9 @@ def relations(
 def relations_of(store: Store, instance_id: int) -> list[Relation]:
     """Return the stored relations of an instance, each once: of two inverse ones that in which it is the subject."""
     own = store.relations.all(instance_id, None, None)
-    told = {(r.predicate, r.object) for r in own}
+    stored = {(r.predicate, r.object) for r in own}
     others = store.relations.all(None, None, instance_id)
-    return [*own, *(r for r in others if (INVERSE.get(r.predicate), r.subject) not in told)]
+    return [*own, *(r for r in others if (INVERSE.get(r.predicate), r.subject) not in stored)]
 
 
 def viewer_from(store: Store, viewpoint: Place) -> Viewpoint | None:
@@ -155,7 +154,7 @@ def _stored(store: Store, subjects: list[int] | None, predicate: str | None, obj
         if (allowed[0] is None or r.subject in allowed[0]) and (allowed[1] is None or r.object in allowed[1])
     ]
     if store.facts.gravity not in ("known", "estimated"):
-        why = "gravity is unknown in this memory, and with it what is on, in, above or under what"
+        why = "gravity is unknown in this memory, so on, in, above and under are unknown too"
         if predicate in VERTICAL and not found:
             return Relations([], "unknown", why)
         if predicate is None:
@@ -171,7 +170,7 @@ def _viewed(
         return Relations(
             [],
             "unknown",
-            "gravity is unknown in this memory, and with it left and right; use a camera as the viewpoint",
+            "gravity is unknown in this memory, so left and right are unknown too; use a camera as the viewpoint",
         )
     things = {i.id: i for i in store.instances.all()}
     if subjects is None and objects is None:
@@ -234,8 +233,8 @@ def noise_of(store: Store) -> float:
 
 
 def unit_of(store: Store) -> float:
-    """Estimate what a metre is in world units: 1 where the memory is metric, else told by the distances of things from
-    the cameras, which stand about two metres from what they look at indoors.
+    """Return what a metre is in world units: 1 if the memory is metric, else an estimate from the distances of things
+    from the cameras, which stand about two metres from what they look at indoors.
     """
     if store.facts.scale_kind != "relative":
         return 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Unpack
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_share
 from list3r.memory.records import BestView
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
@@ -91,8 +91,7 @@ def visible(
     hides is everything the memory holds, structure too, `max_depth` (world units) away at most; what moves is where it
     was last. Filters: see `Filters`. Raises `OptionError`.
     """
-    if not 0.0 <= min_visible <= 1.0:
-        raise OptionError(f"min_visible {min_visible} must lie between 0 and 1")
+    check_share("min_visible", min_visible)
     if max_depth is not None and not 0.0 < max_depth < float("inf"):
         raise OptionError(f"max_depth {max_depth} must be a finite length above 0")
     filters = Filters(**options)

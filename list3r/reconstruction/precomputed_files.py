@@ -18,7 +18,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from list3r.frames.files import check_ordinary, read_file
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, first_line
 from list3r.memory.unpacking import open_archive, parse_json
 
 MANIFEST = "precomputed.json"
@@ -80,11 +80,11 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         raise OptionError(f"{folder} has no {MANIFEST}; see docs/precomputed.md, or write it with `list3r precompute`")
     if path.stat().st_size > _MAX_MANIFEST:
-        raise OptionError(f"{path} is {path.stat().st_size} bytes long and no manifest")
+        raise OptionError(f"{path} is {path.stat().st_size} bytes long and not a manifest")
     try:
         said = parse_json(read_file(path, _MAX_MANIFEST))
     except (ValueError, RecursionError) as error:
-        raise OptionError(f"{path} is no JSON ({str(error).splitlines()[0][:120]}); see docs/precomputed.md") from None
+        raise OptionError(f"{path} is not JSON ({first_line(error)}); see docs/precomputed.md") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("version") != VERSION:
         raise OptionError(f'{path} must say "format": "{FORMAT}", "version": {VERSION}')
     if said.get("scale") not in ("metric", "relative"):
@@ -180,7 +180,7 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     except OptionError:
         raise
     except Exception as error:  # what zipfile, zlib and NumPy raise on damaged bytes is not a closed list
-        reason = (str(error) or type(error).__name__).splitlines()[0][:160]
+        reason = first_line(error)
         raise OptionError(f"{path} cannot be read: {reason}") from None
 
 
@@ -196,7 +196,7 @@ def read_array(path: Path) -> NDArray[Any]:
         check_ordinary(path.stat(), path, MAX_BYTES)
         return np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0][:160]
+        reason = first_line(error)
         raise OptionError(f"{path} cannot be read: {reason}") from None
 
 

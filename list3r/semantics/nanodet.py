@@ -166,8 +166,8 @@ def _kind(scale: float) -> int:
 
 
 def _trained_side(param: Path) -> int:
-    said = re.search(r"(?<!\d)(\d{3})(?!\d)", param.stem)
-    return int(said[1]) if said and int(said[1]) % 32 == 0 else _INPUT_SIDE
+    found = re.search(r"(?<!\d)(\d{3})(?!\d)", param.stem)
+    return int(found[1]) if found and int(found[1]) % 32 == 0 else _INPUT_SIDE
 
 
 def _strides(param: Path) -> list[int]:

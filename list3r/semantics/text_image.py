@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, first_line
 from list3r.memory.unpacking import parse_json
 from list3r.models.images import HALF, InputShape, network_input
 from list3r.models.pretrained import load_pretrained, pick_device, space_name
@@ -123,8 +123,7 @@ def _tokenizer(folder: Path) -> Any:
     try:
         return AutoTokenizer.from_pretrained(folder, local_files_only=True)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ImportError) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise OptionError(f"{folder} has no tokenizer that can be read ({lines[0][:120]}); fetch it again") from None
+        raise OptionError(f"{folder} has no tokenizer that can be read ({first_line(error)}); fetch it again") from None
 
 
 def _vector(out: Any) -> NDArray[np.float32]:

@@ -1,13 +1,13 @@
 """Boxes of a detector vote for what things are called, over many frames.
 
-A box speaks of the thing whose mask in that frame fills it best. Its score, calibrated by how well the two fit, is the
-probability that the class is right; a frame that sees the thing well and finds nothing of a class speaks against it.
+A box is a vote for the thing whose mask in that frame fills it best. Its score, calibrated by how well the two fit, is
+the probability of the class; a frame that sees the thing well and finds nothing of a class is a vote against it.
 Log odds add up over frames, so they can be kept for each local instance and added again however local instances are
 grouped later; that pictures of one thing are alike is accounted for there (`memory.labels`).
 
 Boxes count from a score of 0.1: a chair that is found with 0.2 to 0.35 in each of eight pictures is a chair, and a
 threshold of 0.3, which suits single pictures, left it to chance (redkitchen: 3 or 4 of 5 chairs and up to two false
-names by the threshold, 5 and one without, for both networks at hand). Adding up low scores as if each picture were
+names by the threshold, 5 and one without, for both networks). Adding up low scores as if each picture were
 independent is worse: every leaflet becomes a bottle or a TV (up to 20 false names).
 """
 
@@ -28,7 +28,7 @@ from list3r.semantics.detector import Detections
 
 @dataclass(frozen=True)
 class VotingSettings:
-    """When a box speaks of a thing."""
+    """When a box is a vote for a thing."""
 
     min_overlap: float = 0.3
     """Least IoU of a box and the box around a mask."""
@@ -145,6 +145,6 @@ def _fit(box: NDArray[np.float32], thing: ThingInFrame, s: VotingSettings) -> fl
 
 
 def _odds(probability: float, s: VotingSettings) -> float:
-    """Log odds by which a box of this score, times how well it fits, speaks for its class."""
+    """Log odds by which a box of this score, times how well it fits, supports its class."""
     p = min(max(probability / s.box_quality, 1e-3), 0.95)
     return math.log(p / (1.0 - p)) - PRIOR_ODDS

@@ -55,7 +55,7 @@ class HttpSettings:
         if not 0 <= self.port <= 65535:
             raise OptionError(f"port {self.port} must lie between 0 and 65535")
         if self.token and len(self.token) < 16:
-            raise OptionError("the token is too short to keep anybody out; give at least 16 characters")
+            raise OptionError("the token is too short to be safe; give at least 16 characters")
 
 
 class _OneToken:
@@ -74,7 +74,7 @@ class _OneToken:
 def make_server(served: SceneMemory | Catalog, *, http: HttpSettings | None = None) -> MCPServer[Any]:
     """Return the server of a catalogue or of a memory, with tools that edit where the memory is open for writing.
 
-    With `http` (port and token given) clients must bear the token.
+    With `http` (port and token given) clients must send the token.
     """
     guard: dict[str, Any] = {}
     if http is not None:
@@ -89,12 +89,12 @@ def make_server(served: SceneMemory | Catalog, *, http: HttpSettings | None = No
         **guard,
     )
     for tool in _public_methods(CatalogTools(served) if isinstance(served, Catalog) else ReadingTools(served)):
-        server.tool(annotations=ToolAnnotations(read_only_hint=True, open_world_hint=False))(_told(tool))
+        server.tool(annotations=ToolAnnotations(read_only_hint=True, open_world_hint=False))(_with_errors(tool))
     if isinstance(served, Catalog):
         return server
     if served.writable:
         for tool in _public_methods(WritingTools(served)):
-            server.tool(annotations=ToolAnnotations(read_only_hint=False, open_world_hint=False))(_told(tool))
+            server.tool(annotations=ToolAnnotations(read_only_hint=False, open_world_hint=False))(_with_errors(tool))
     _add_resources(server, served)
     _add_prompts(server)
     return server
@@ -108,7 +108,7 @@ def serve_stdio(served: SceneMemory | Catalog) -> None:
 def serve_http(served: SceneMemory | Catalog, settings: HttpSettings, started: Callable[[str, str], None]) -> None:
     """Serve clients of this machine over streamable HTTP until interrupted.
 
-    `started` is told the address and the token once the server listens. A request must bear the token, name this host
+    `started` gets the address and the token once the server listens. A request must carry the token, name this host
     and come from no foreign web page. Raises `OptionError` where the port is taken.
     """
     import uvicorn
@@ -139,7 +139,7 @@ def _listen(port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, port))
-        listener.listen()  # who is told the address may come before the server is ready
+        listener.listen()  # whoever gets the address may connect before the server is ready
     except OSError as error:
         listener.close()
         raise OptionError(f"port {port} of {HOST} cannot be used ({error.strerror}); choose another one") from error
@@ -152,17 +152,17 @@ def _public_methods(tools: object) -> Iterator[Callable[..., Any]]:
             yield getattr(tools, name)
 
 
-def _told(tool: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the same tool; errors that the user can mend reach the agent as one line."""
+def _with_errors(tool: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the same tool; errors that the user can fix reach the agent as one line."""
 
     @functools.wraps(tool)
-    def asked(*args: Any, **words: Any) -> Any:
+    def call(*args: Any, **kwargs: Any) -> Any:
         try:
-            return tool(*args, **words)
+            return tool(*args, **kwargs)
         except List3rError as error:
             raise ToolError(str(error)) from error
 
-    return asked
+    return call
 
 
 def _add_resources(server: MCPServer[Any], memory: SceneMemory) -> None:

@@ -31,13 +31,13 @@ class CatalogTools:
 
     def find(self, text: Words, memory: InMemory = None, limit: Limit = 10) -> dict[str, Any]:
         """The things that a phrase describes, such as "red toolbox" or "mug on table", in one memory or over all."""
-        return _told(self._catalog.find(text, memory, k=limit))
+        return _as_page(self._catalog.find(text, memory, k=limit))
 
     def nearest(
         self, memory: Memory, id: Id | None = None, point: Point | None = None, limit: Limit = 5
     ) -> dict[str, Any]:
         """The things of one memory nearest to an instance or to a point, by their boxes."""
-        return _told(self._catalog.nearest(memory, instance_id=id, point=point, k=limit))
+        return _as_page(self._catalog.nearest(memory, instance_id=id, point=point, k=limit))
 
     def within(
         self,
@@ -50,11 +50,11 @@ class CatalogTools:
     ) -> dict[str, Any]:
         """The things of one memory in a sphere (center, radius) or in a box (lower and upper corner)."""
         found = self._catalog.within(memory, lower=lower, upper=upper, center=center, radius=radius)
-        return _told(found, limit)
+        return _as_page(found, limit)
 
     def similar(self, memory: Memory, id: Id, everywhere: bool = True, limit: Limit = 10) -> dict[str, Any]:
         """The things that look like a given instance, in all memories or in its own."""
-        return _told(self._catalog.similar(memory, instance_id=id, anywhere=everywhere, k=limit))
+        return _as_page(self._catalog.similar(memory, instance_id=id, anywhere=everywhere, k=limit))
 
     def relations(
         self,
@@ -65,10 +65,10 @@ class CatalogTools:
         limit: Limit = 20,
     ) -> dict[str, Any]:
         """Stored relations (on, in, next_to, near, ...) in one memory or over all, by words or ids."""
-        return _told(self._catalog.relations(memory, subject=subject, predicate=predicate, object=object, k=limit))
+        return _as_page(self._catalog.relations(memory, subject=subject, predicate=predicate, object=object, k=limit))
 
 
-def _told(found: CatalogAnswers, limit: int | None = None) -> dict[str, Any]:
+def _as_page(found: CatalogAnswers, limit: int | None = None) -> dict[str, Any]:
     """Return answers as plain values; each names its memory, file and units."""
     rows: Sequence[Any] = found if limit is None else found[:limit]
     texts = ("label", "description", "subject_name", "object_name")

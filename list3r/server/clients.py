@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import check_choice
 
 CLIENTS = {
     "claude": ("mcpServers", "claude_desktop_config.json, or .mcp.json of a project"),
@@ -21,8 +21,7 @@ CLIENTS = {
 
 def config_entry(memory: Path, client: str, *, write: bool = False) -> tuple[str, str]:
     """Return the file that a program reads and the text to put into it. Raises `OptionError` for an unknown one."""
-    if client not in CLIENTS:
-        raise OptionError(f"client {client!r} is not known; choose one of: {', '.join(CLIENTS)}")
+    check_choice("client", client, CLIENTS)
     table, file = CLIENTS[client]
     name = f"list3r-{memory.stem}"
     arguments = ["-m", "list3r", "mcp", str(memory.resolve()), *(["--write"] if write else [])]

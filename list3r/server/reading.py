@@ -74,8 +74,8 @@ class ReadingTools:
         An empty answer means that nothing fits; `notes` name the words that describe nothing.
         """
         found = self._memory.find(text, limit)
-        told = {"total": found.total, "ambiguous": found.ambiguous, "unknown_words": list(found.unknown_words)}
-        return {**self._matches(found, found.notes), **told}
+        result = {"total": found.total, "ambiguous": found.ambiguous, "unknown_words": list(found.unknown_words)}
+        return {**self._matches(found, found.notes), **result}
 
     def nearest(
         self,

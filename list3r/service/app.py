@@ -23,7 +23,7 @@ from list3r.service.limits import Application, Guard, Metrics, ServiceLimits, er
 
 CATALOG_VARIABLE, SECRET_VARIABLE = "LIST3R_CATALOG", "LIST3R_SERVE_SECRET"
 TIMEOUT_VARIABLE = "LIST3R_SERVE_TIMEOUT_S"
-"""How a process of a service is told its limit of time, by the one that starts it."""
+"""How the process that starts a service passes on its time limit."""
 
 Text = Annotated[str, Query(min_length=1, max_length=500)]
 Maybe = Annotated[str | None, Query(max_length=500)]
@@ -85,7 +85,7 @@ Filtered = Annotated[Which, Depends()]
 
 
 def make_service(catalog: Catalog, secret: str, limits: ServiceLimits | None = None) -> Application:
-    """Return the application of a catalogue; clients must bear a token of the `secret`."""
+    """Return the application of a catalogue; clients must send a token of the `secret`."""
     limits, metrics = limits or ServiceLimits(), Metrics()
     app = FastAPI(title="list3r", version=__version__, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
     state, asked = _State(catalog, metrics), _Questions(catalog, limits)
@@ -213,7 +213,7 @@ def _answer(matches: Sequence[Any], notes: Iterable[str] = (), **facts: Any) -> 
 
 
 async def _explained(request: Request, error: Exception) -> JSONResponse:
-    """What the user can mend is 400, what is not there 404, and a catalogue that does not answer 503."""
+    """What the user can fix is 400, what is not there 404, and a catalogue that does not answer 503."""
     unknown = isinstance(error, UnknownIdError | UnknownMemoryError)
     status = 404 if unknown else 503 if isinstance(error, CatalogError) else 400
     return JSONResponse(error_answer(status, type(error).__name__, str(error)), status)

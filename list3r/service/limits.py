@@ -23,7 +23,7 @@ Send = Callable[[Message], Awaitable[None]]
 Application = Callable[[Message, Receive, Send], Awaitable[None]]
 
 OPEN_PATHS = frozenset(("/health",))
-"""Answered without a token; they tell nothing of what is catalogued."""
+"""Answered without a token; they say nothing of what is catalogued."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class ServiceAddress:
 def serve(
     catalog: str, secret: str, address: ServiceAddress, limits: ServiceLimits, started: Callable[[str], None]
 ) -> None:
-    """Serve a catalogue until interrupted. `started` is told the address once the port is taken.
+    """Serve a catalogue until interrupted. `started` gets the address once the port is taken.
 
     Raises `OptionError` where the port is taken, `CatalogError` where the catalogue cannot be opened.
     """

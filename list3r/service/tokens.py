@@ -15,9 +15,9 @@ SHORTEST_SECRET = 16
 def make_token(secret: str, hours: float, now_s: float | None = None) -> str:
     """Return a token that holds for some hours. Raises `OptionError` for a secret that keeps nobody out."""
     if len(secret) < SHORTEST_SECRET:
-        raise OptionError(f"the secret is too short to keep anybody out; give at least {SHORTEST_SECRET} characters")
+        raise OptionError(f"the secret is too short to be safe; give at least {SHORTEST_SECRET} characters")
     if not 0 < hours <= 24 * 366:
-        raise OptionError(f"a token for {hours:g} hours: it must hold for more than 0, and for a year at the most")
+        raise OptionError(f"a token for {hours:g} hours: it must be valid for more than 0 hours and at most a year")
     until = int((time.time() if now_s is None else now_s) + hours * 3600)
     return f"{until}.{_signature(secret, until)}"
 

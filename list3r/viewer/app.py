@@ -83,8 +83,8 @@ class Viewer:
         if session is None or not sessions or session >= sessions[-1]:
             return read_world(self.memory, self.memory.changes())
         with open_scene(self.memory.path, at=session) as before:
-            told = [c for c in self.memory.changes() if c.event.session_id == session]
-            return read_world(before, told)
+            changes = [c for c in self.memory.changes() if c.event.session_id == session]
+            return read_world(before, changes)
 
     def show(self, **changed: Any) -> None:
         """Change what is shown: fields of `ViewState`."""
@@ -99,7 +99,7 @@ class Viewer:
                 self.panel.follow(self.state)
 
     def reload(self) -> None:
-        """Read the memory anew, after an edit."""
+        """Read the memory again, after an edit."""
         with self._lock:
             self.world = self._read()
             if self.state.selected not in self.world.instances:
@@ -202,11 +202,11 @@ class Viewer:
 
     def link(self, client: viser.ClientHandle | None) -> str:
         """Return the address that restores the view of a page."""
-        told = [f"view={self.state.encode()}"]
+        parts = [f"view={self.state.encode()}"]
         if client is not None:
             for name, place in (("Position", client.camera.position), ("LookAt", client.camera.look_at)):
-                told.append(f"initialCamera{name}={','.join(f'{v:.3f}' for v in place)}")
-        return f"{self.address}/?{'&'.join(told)}"
+                parts.append(f"initialCamera{name}={','.join(f'{v:.3f}' for v in place)}")
+        return f"{self.address}/?{'&'.join(parts)}"
 
     # ------------------------------------------------------------------ events
 

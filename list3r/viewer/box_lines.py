@@ -47,7 +47,7 @@ def thin_lines(corners: NDArray[np.float32], rgb: NDArray[np.uint8]) -> bytes:
         {"type": "VEC4", "componentType": _BYTE, "count": 8 * count, "normalized": True},
         {"type": "SCALAR", "componentType": _INDEX, "count": len(edges)},
     ]
-    told = {
+    document = {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -59,7 +59,7 @@ def thin_lines(corners: NDArray[np.float32], rgb: NDArray[np.uint8]) -> bytes:
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
-    text, data = json.dumps(told).encode(), b"".join(parts)
+    text, data = json.dumps(document).encode(), b"".join(parts)
     text, data = text + b" " * (-len(text) % 4), data + b"\0" * (-len(data) % 4)
     head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
     return head + text + struct.pack("<II", len(data), 0x004E4942) + data

@@ -21,7 +21,7 @@ _BOX = 25
 """A box of thin lines takes as long to draw as this many points."""
 _POINT_M, _COARSE_M = 0.012, 0.03
 _MOVED_SHARE = 0.1
-"""The camera must move by this share of its distance to what it looks at before detail is drawn anew."""
+"""The camera must move by this share of its distance to what it looks at before detail is drawn again."""
 
 
 @dataclass(frozen=True)

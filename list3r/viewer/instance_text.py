@@ -29,9 +29,9 @@ def described(memory: SceneMemory, world: ShownWorld, instance_id: int, relation
     if own:
         first = {r.object: r for r in reversed(own)}  # of each other instance the most telling
         kept = [r for r in own if first[r.object] is r]
-        told = [f"- {r.predicate.replace('_', ' ')} {r.object} {_plain(world.name(r.object))}" for r in kept]
-        lines += ["", "**Relations**", "", *told[:_MOST_RELATIONS]]
-        lines += [f"- and {len(told) - _MOST_RELATIONS} more"] if len(told) > _MOST_RELATIONS else []
+        sentences = [f"- {r.predicate.replace('_', ' ')} {r.object} {_plain(world.name(r.object))}" for r in kept]
+        lines += ["", "**Relations**", "", *sentences[:_MOST_RELATIONS]]
+        lines += [f"- and {len(sentences) - _MOST_RELATIONS} more"] if len(sentences) > _MOST_RELATIONS else []
     history = [c for c in memory.changes() if c.instance.id == i.id]
     if history:
         lines += ["", "**History**", ""]

@@ -30,7 +30,7 @@ class LayerSettings:
 
 
 class Layers:
-    """The scene of one server; every layer is drawn anew when what it shows changes."""
+    """The scene of one server; every layer is drawn again when what it shows changes."""
 
     def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
         self._scene, self._settings = server.scene, settings
@@ -120,9 +120,9 @@ class Layers:
         nodes: list[Any] = [
             self._scene.add_line_segments("/relations/lines", ends, _INK, thickness=2.0, thickness_units="screen")
         ]
-        for n, told in words.items():
+        for n, label in words.items():
             middle = 0.35 * start + 0.65 * world.instances[n].center
-            text = f"{', '.join(told)} {n}"
+            text = f"{', '.join(label)} {n}"
             nodes.append(self._scene.add_label(f"/relations/{n}", text, position=middle, font_screen_scale=0.7))
         self._nodes["relations"] = nodes
 

@@ -29,21 +29,21 @@ class ViewState:
     def encode(self) -> str:
         """Return the code."""
         usual = ViewState()
-        told = {k: v for k, v in asdict(self).items() if v != getattr(usual, k)}
-        return base64.urlsafe_b64encode(json.dumps(told, separators=(",", ":")).encode()).decode().rstrip("=")
+        fields = {k: v for k, v in asdict(self).items() if v != getattr(usual, k)}
+        return base64.urlsafe_b64encode(json.dumps(fields, separators=(",", ":")).encode()).decode().rstrip("=")
 
     @staticmethod
     def decode(code: str) -> ViewState:
         """Return the view of a code; what a code says that makes no sense is as usual."""
         try:
             padded = code[:_LONGEST] + "=" * (-len(code[:_LONGEST]) % 4)
-            told = json.loads(base64.urlsafe_b64decode(padded))
+            given = json.loads(base64.urlsafe_b64decode(padded))
         except (ValueError, binascii.Error):
             return ViewState()
-        if not isinstance(told, dict):
+        if not isinstance(given, dict):
             return ViewState()
         return ViewState(
-            **{f.name: told[f.name] for f in fields(ViewState) if f.name in told and _sound(f.name, told[f.name])}
+            **{f.name: given[f.name] for f in fields(ViewState) if f.name in given and _sound(f.name, given[f.name])}
         )
 
 

@@ -37,7 +37,7 @@ class Panel:
         self._search()
         self._picture = self._gui.add_image(_BLANK, visible=False)
         self._text = self._gui.add_markdown("")
-        self._said = self._gui.add_markdown("", visible=False)
+        self._message = self._gui.add_markdown("", visible=False)
         self._layers()
         self._times()
         if viewer.memory.writable:
@@ -55,7 +55,7 @@ class Panel:
 
     def say(self, text: str) -> None:
         """Say what was done, or why not."""
-        self._said.content, self._said.visible = text, bool(text)
+        self._message.content, self._message.visible = text, bool(text)
 
     def found(self, ids: list[int], names: list[str], notes: str) -> None:
         """Offer the answers of a search."""

@@ -20,7 +20,7 @@ _OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
 def start_server(port: int, title: str, asked_for: Callable[[str], None]) -> viser.ViserServer:
     """Return a running server on this machine; `port` or the next free one.
 
-    `asked_for` is told the code of every page that is opened with `?view=CODE`.
+    `asked_for` gets the code of every page that is opened with `?view=CODE`.
     """
     with _guarded(asked_for), quiet():
         server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)

@@ -1,5 +1,6 @@
-"""How much each edge of the graph has to say: its information matrix, from its covariance, the bending of chunks and
-its confidence (paper A.4).
+"""The information matrix of each edge of the graph, from its covariance and the bending of chunks.
+
+The paper weighs edges by their confidence instead (A.4): `benchmarks/peers/graph_weights.py`, docs/decisions/0041.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.graph.solver import adjoint, stack
-from list3r.memory.geometry import skew
+from list3r.association.graph.solver import adjoint
+from list3r.memory.geometry import skew, stack
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
@@ -21,12 +22,6 @@ Array = NDArray[np.float64]
 class WeightSettings:
     """How edges are weighted."""
 
-    alpha: float = 0.30
-    """The paper's alpha of the edge weight."""
-    sharpness: float = 6.0
-    """The paper's exponent g of the edge weight."""
-    sharpen: bool = False
-    """Whether the information of edges is multiplied by the paper's weight; why not: docs/decisions/0041."""
     lever_m: float = 1.0
     """Distance at which a turn counts as much as a shift where an edge does not say, metres; without metric scale half
     the spread of its points takes its place."""
@@ -43,22 +38,10 @@ class WeightSettings:
     """The same for the error of an edge without a covariance at confidence 1."""
 
 
-def edge_weights(confidence: Array, settings: WeightSettings) -> Array:
-    """Return weights of edges from their confidence m (paper A.4), the strongest edge 1. Shape (E,).
-
-    With the paper's constants all raw weights are below 3.3e-4, so only their ratios mean something.
-    """
-    grown = np.log1p(settings.alpha * np.clip(confidence, 0.0, 1.0))
-    u = grown / (1.0 + grown)
-    raw = u**settings.sharpness / (u**settings.sharpness + (1.0 - u) ** settings.sharpness)
-    return np.asarray(raw / raw.max() if raw.size and raw.max() > 0 else np.ones_like(raw))
-
-
-def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
+def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
     """Return the inverse covariances of the edges' tangent errors with bending, in u's units.
 
-    Shape (E, D, D), D = 6 if metric else 7. The paper's sharpened confidence (A.4) is not multiplied in, see
-    docs/decisions/0041.
+    Shape (E, D, D), D = 6 if metric else 7.
     """
     size = 6 if metric else 7
     covariance = np.empty((len(edges), 7, 7))
@@ -68,10 +51,7 @@ def information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -
     for k in np.flatnonzero(~measured).tolist():
         covariance[k] = _unmeasured(edges[k], metric, settings)
     inverse = np.linalg.inv(covariance[:, :size, :size])
-    inverse = (inverse + np.swapaxes(inverse, 1, 2)) / 2.0
-    if settings.sharpen:
-        inverse *= np.maximum(edge_weights(np.array([e.confidence for e in edges]), settings), 1e-6)[:, None, None]
-    return np.asarray(inverse)
+    return np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2.0)
 
 
 def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settings: WeightSettings) -> Array:
@@ -93,15 +73,7 @@ def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settin
     return np.asarray(out * (settings.own_bend / settings.bend) ** 2 / np.maximum(seen, 1)[:, None, None])
 
 
-def plain_information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
-    """Return the same for every edge, angles and shifts in one unit: plain least squares. Shape (E, D, D)."""
-    levers = [lever for e in edges if (lever := _lever(e, metric, settings)) is not None]
-    lever = float(np.median(levers)) if levers else settings.lever_m
-    unit = np.array([lever] * 3 + [1.0] * (3 if metric else 4)) * settings.unmeasured
-    return np.tile(np.diag(1.0 / unit**2), (len(edges), 1, 1))
-
-
-def _lever(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
+def lever_of(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
     """Return half the spread of an edge's points in u's units; None where it does not say."""
     if metric or "spread" not in edge.scores:
         return settings.lever_m if metric else None
@@ -110,7 +82,7 @@ def _lever(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
 
 def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
     """Return the covariance of an edge that states none. Shape (7, 7)."""
-    lever = _lever(edge, metric, settings) or settings.lever_m
+    lever = lever_of(edge, metric, settings) or settings.lever_m
     deviation = settings.unmeasured / np.sqrt(max(edge.confidence, settings.least_confidence))
     unit = np.array([lever] * 3 + [1.0] * 4)
     return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bend**2)))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra
 
+from list3r.association.graph.edge_information import information_of
 from list3r.association.graph.loop_trust import NO_TRUST
 from list3r.association.graph.pose_graph import (
     GraphResult,
@@ -24,13 +25,12 @@ from list3r.association.graph.pose_graph import (
     check,
     contradicted,
     deviations_of,
-    information_of,
     optimize,
     problem_of,
 )
-from list3r.association.graph.solver import adjoint, stack, unstack
+from list3r.association.graph.solver import adjoint, unstack
 from list3r.association.quantiles import chi2_quantile
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ def extend(
 ) -> GraphResult:
     """Place one more chunk in a graph whose other chunks lie as `placed` says (as `optimize` or `extend` put them).
 
-    A chunk that hangs on one edge is chained: that is the optimum. One with loops that agree with the map is fitted to
+    A chunk with a single edge is chained: that is the optimum. One with loops that agree with the map is fitted to
     it alone; if its edges do not fit then, the chunks on the way that the loops close and those near them move by a
     Gauss-Newton step; if it joins components, all are solved from the beginning. Only the edges of the new chunk are
     judged, and covariances of the others stay: `optimize` at the end of a session judges all.
@@ -69,7 +69,7 @@ def extend(
     poses = stack([start if k == new else placed.S_graph_chunk[k] for k in ids])
     factors = _factors(edges)
     loop = np.array([_kind(e) for e in active])
-    weights = information_of(active, metric, chosen) / factors[loop, None, None]
+    weights = information_of(active, metric, chosen.weights) / factors[loop, None, None]
     problem = problem_of(active, row, np.array([k != new for k in ids]), weights)
     if len(active) > 1:
         poses = problem.solve(poses, np.ones(len(active)), 5)
@@ -111,7 +111,7 @@ def _moved(
     fixed = ~np.isin(ids, near) | np.array([components.get(k) == k for k in ids])
     loop = np.array([_kind(e) for e in active])
     factors = _factors(edges)
-    weights = information_of(active, metric, settings) / factors[loop, None, None]
+    weights = information_of(active, metric, settings.weights) / factors[loop, None, None]
     problem = problem_of(active, row, fixed, weights)
     poses = stack([poses_of[k] for k in ids])
     own = np.isin(used, mine)

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 NO_TRUST = 1e-9
-"""What edges that are not believed weigh, so that what hangs on them alone stays put."""
+"""What edges that are not believed weigh, so that what they alone join stays where it is."""
 
 
 _SETTLED = 0.05
@@ -40,22 +40,22 @@ class TrustSettings:
     loop_quantile: float = 0.999
     """Share of true loops whose error lies inside the limit, were all errors as stated."""
     adjacent_limit: float = 4.0
-    """The limit of adjacent edges, in limits of loops: so many agreeing loops outvote one."""
+    """The limit of adjacent edges, in limits of loops: this many agreeing loops outvote one."""
     least_loops: float = 0.5
     """Least share of loops and"""
     least_adjacent: float = 0.9
     """of adjacent edges that must be believed before errors are taken to be as stated."""
     prior_loops: int = 4
-    """Loops that speak for the stated drift of the chain when its true drift is measured."""
+    """Loops that support the stated drift of the chain when its true drift is measured."""
     most_drift: float = 30.0
     """Largest factor by which the chain may have drifted more than stated (deviations, not squares)."""
     prior_freedom: float = 10.0
-    """Degrees of freedom that speak for the stated errors of edges."""
+    """Degrees of freedom that support the stated errors of edges."""
     anneal_step: float = 1.6
     """Factor by which the kernel tightens from stage to stage of the annealing; larger ones lose true edges, see
     docs/decisions/0042."""
     rounds: int = 8
-    """Most times that errors are scaled and edges judged anew."""
+    """Most times that errors are scaled and edges judged again."""
     iterations: int = 20
     """Most steps of a solution; each stage of the annealing takes a quarter."""
 

@@ -61,6 +61,6 @@ def variance_factors(
 
 
 def widening(freedom: float) -> float:
-    """Return the factor on a covariance whose scale was estimated with so many degrees of freedom: F against chi^2 at
+    """Return the factor on a covariance whose scale was estimated with this many degrees of freedom: F against chi^2 at
     95 %."""
     return 3.0 * f_quantile(0.95, 3, freedom) / chi2_quantile(0.95, 3)

@@ -24,17 +24,18 @@ from list3r.association.graph.chunk_nodes import (
     measured_walk,
     walk_covariance,
 )
-from list3r.association.graph.pose_graph import GraphResult, GraphSettings, information_of
+from list3r.association.graph.edge_information import information_of
+from list3r.association.graph.pose_graph import GraphResult, GraphSettings
 from list3r.association.graph.sampled_chunks import SampledChunks
-from list3r.association.graph.solver import GraphProblem, stack, take, unstack
+from list3r.association.graph.solver import GraphProblem, unstack
 from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack, take
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
 
 _NOTHING = 1e9
-"""Variance factor of edges that are not believed, so that what hangs on them alone stays put."""
+"""Variance factor of edges that are not believed, so that what they alone join stays where it is."""
 _STEPS = 10
 """Most steps of the solution; it starts near."""
 
@@ -144,7 +145,7 @@ def _problem(
     if rest:
         factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
         factors[[not e.accepted for e in rest]] *= _NOTHING
-        stiff = replace(weights, weights=replace(weights.weights, bend=0.0))  # the nodes bend instead
+        stiff = replace(weights.weights, bend=0.0)  # the nodes bend instead
         information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
     fixed = np.zeros(pieces.count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True

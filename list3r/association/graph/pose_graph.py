@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 
-from list3r.association.graph.edge_information import WeightSettings, information, own_shapes, plain_information
+from list3r.association.graph.edge_information import WeightSettings, information_of, own_shapes
 from list3r.association.graph.loop_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
 from list3r.association.graph.marginals import widening
-from list3r.association.graph.solver import GraphProblem, adjoint, stack, take, unstack
+from list3r.association.graph.solver import GraphProblem, adjoint, unstack
 from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack, take
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
@@ -29,10 +29,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """How the graph is weighted and solved. Without `weighted` and `robust`: plain least squares, as VGGT-Long."""
+    """How the graph is weighted and solved."""
 
-    weighted: bool = True
-    """Edges count by their information; else all the same."""
     robust: bool = True
     """Edges that the rest contradicts are switched off."""
     weights: WeightSettings = field(default_factory=WeightSettings)
@@ -70,7 +68,7 @@ def optimize(
     metric: bool,
     settings: GraphSettings | None = None,
 ) -> GraphResult:
-    """Place all chunks. The first chunk of each component stays at `initial`, or at the origin where that is silent.
+    """Place all chunks. The first chunk of each component stays at `initial`, or at the origin if it is not in it.
 
     Edges that geometry did not accept are passed through; those that an earlier call rejected are tried again. Raises
     `DegenerateError` for an edge that holds a number that is not finite.
@@ -84,7 +82,7 @@ def optimize(
     check(active)
     component = _components(ids, active)
     out = list(edges)
-    weights = information_of(active, metric, chosen)
+    weights = information_of(active, metric, chosen.weights)
     weak = _weak(active, ids, weights, chosen)
     weights = np.delete(weights, weak, axis=0)
     for n in reversed(weak):
@@ -117,11 +115,6 @@ def problem_of(
     """Return the graph of some edges with information `weights` (E, D, D); `row` numbers the chunks."""
     u, v = np.array([row[e.u] for e in active]), np.array([row[e.v] for e in active])
     return GraphProblem.build(u, v, stack([e.S_v_u for e in active]), weights, fixed)
-
-
-def information_of(edges: Sequence[Edge], metric: bool, settings: GraphSettings) -> Array:
-    """Return the information of each edge. Shape (E, D, D)."""
-    return (information if settings.weighted else plain_information)(edges, metric, settings.weights)
 
 
 def check(edges: Sequence[Edge]) -> None:
@@ -161,7 +154,7 @@ def _strengths(information: Array) -> Array:
 
 def _weak(edges: Sequence[Edge], ids: Sequence[int], weights: Array, settings: GraphSettings) -> list[int]:
     """Return numbers of the loops that say next to nothing; none where the graph would fall apart without them."""
-    if not settings.weighted or not any(e.kind != "adjacent" for e in edges):
+    if not any(e.kind != "adjacent" for e in edges):
         return []
     strength = _strengths(weights)
     weak = [k for k, e in enumerate(edges) if e.kind != "adjacent" and strength[k] < settings.least_weight]

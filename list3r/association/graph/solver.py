@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
-from list3r.memory.geometry import Sim3, skew
+from list3r.memory.geometry import Sim3, skew, take
 
 Array = NDArray[np.float64]
 
@@ -144,20 +144,6 @@ class GraphProblem:
             fourth = square @ square
             even += square @ fourth / 30240.0 - fourth / 720.0
         return even + 0.5 * ad, -(even - 0.5 * ad) @ self.turned
-
-
-def stack(poses: Sequence[Sim3]) -> Sim3:
-    """Return one batched similarity of many. Shape (K,)."""
-    return Sim3(
-        np.array([float(p.scale) for p in poses]),
-        np.array([p.rotation for p in poses]).reshape(-1, 3, 3),
-        np.array([p.translation for p in poses]).reshape(-1, 3),
-    )
-
-
-def take(poses: Sim3, rows: NDArray[np.int64]) -> Sim3:
-    """Return some of a batch."""
-    return Sim3(poses.scale[rows], poses.rotation[rows], poses.translation[rows])
 
 
 def unstack(poses: Sim3, names: Sequence[int]) -> dict[int, Sim3]:

@@ -18,9 +18,9 @@ from list3r.association.graph.edge_information import about
 from list3r.association.graph.node_graph import inverses, pieces_of, repeated
 from list3r.association.graph.pose_graph import GraphResult
 from list3r.association.graph.sampled_chunks import SampledChunks
-from list3r.association.graph.solver import GraphProblem, stack, unstack
+from list3r.association.graph.solver import GraphProblem, unstack
 from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
+from list3r.memory.geometry import Sim3, stack
 from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
@@ -64,8 +64,8 @@ def place_by_surfaces(
     ties: list[tuple[Edge, Sim3, Array]] = []
     for edge in believed:
         u, v = pieces.nodes[edge.u], pieces.nodes[edge.v]
-        told = relations.get((edge.u, edge.v)) if edge.kind == "adjacent" else None
-        mean = [] if told is None else ties_of(told, edge, u, v, NodeSettings())
+        relation = relations.get((edge.u, edge.v)) if edge.kind == "adjacent" else None
+        mean = [] if relation is None else ties_of(relation, edge, u, v, NodeSettings())
         if mean:
             ties.append((edge, mean[0].S_v_u, mean[0].covariance + _bending(u, s)))
         elif edge.covariance is not None:

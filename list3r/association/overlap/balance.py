@@ -121,15 +121,15 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
     mean = np.asarray(mean / np.maximum(number, 1e-12)[:, None], np.float64)
     within = ((off - mean[patch]) ** 2).sum(axis=1)
     whole = (mean**2).sum(axis=1)
-    told, filled = (trust > 0) & (number[patch] > 1), number > 0
+    counted, filled = (trust > 0) & (number[patch] > 1), number > 0
     of_patch = np.zeros(len(number), np.int64)
     of_patch[patch[trust > 0]] = regions.of_pair[trust > 0]
     floor = settings.least_deviation**2
-    s_all = max(_variance(within[told]), floor)
+    s_all = max(_variance(within[counted]), floor)
     t_all = max(_variance(whole[filled]) - s_all / max(float(np.median(number[filled])), 1.0), floor)
     s, t = np.full(len(regions.count), s_all), np.full(len(regions.count), t_all)
     for k in range(len(regions.count)):
-        mine, patches = told & (regions.of_pair == k), filled & (of_patch == k)
+        mine, patches = counted & (regions.of_pair == k), filled & (of_patch == k)
         n, m = int(mine.sum()), int(patches.sum())
         s[k] = (n * _variance(within[mine]) + settings.prior_pairs * s_all) / (n + settings.prior_pairs)
         least = settings.least_region_share * t_all

@@ -46,7 +46,7 @@ class MotionSettings:
     least_step: float = 0.03
     """Least share of the depth by which what lies behind must be farther."""
     footprint: float = 1.5
-    """A point within so many sample spacings of its instance's own points in the other frame is found again."""
+    """A point within this many sample spacings of its instance's own points in the other frame is found again."""
     least_points: int = 5
     """Fewest points of an instance on which a pair of frames is judged."""
     least_pairs: int = 6

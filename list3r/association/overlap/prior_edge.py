@@ -1,7 +1,7 @@
 """The relation of two neighbouring chunks by poses that are given but imperfect, with their drift as its weight.
 
 A chunk that was reconstructed with such poses lies in the source's own world by its frames after the last jump. The
-next chunk speaks of that world by the frames between the same two jumps.
+next chunk refers to that world by the frames between the same two jumps.
 """
 
 from __future__ import annotations

@@ -26,9 +26,9 @@ class EdgeSupportSettings:
     least_region_pairs: int = 12
     """Fewest pairs on which a region is judged."""
     factor: float = 3.0
-    """A region moves when it is off by so many times what static regions are off by."""
+    """A region moves when it is off by this many times what static regions are off by."""
     deviations: float = 6.0
-    """... and by so many robust deviations of the static regions more than they are."""
+    """... and by this many robust deviations of the static regions more than they are."""
     least_pixels: float = 0.002
     """... and by no less than this share of the image's width."""
     least_depth: float = 0.01

@@ -1,8 +1,8 @@
-"""What the edges known so far say of how two chunks lie, and how sure that is: a gate for supposed revisits.
+"""Predict the relation of two chunks from the chain of accepted edges between them: a gate for supposed revisits.
 
-Copies of one room differ in nothing but their place, so no comparison of what was seen tells them apart; the way the
-camera went does. The way is as uncertain as its edges and as each chunk on it is bent; a relation that lies far outside
-of that is refused.
+Copies of one room differ only in where they are, so comparing what was seen cannot distinguish them; the camera's path
+can. A chain is as uncertain as its edges and as the bending of each chunk on it. A relation that lies far outside of
+that uncertainty is refused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """How far a chain of edges can be trusted. The deviations are of one chunk on the way, bending included."""
+    """How far a chain of edges can be trusted. The deviations are of one chunk of the chain, bending included."""
 
     shift: float = 0.04
     """Deviation of a shift, as a share of the spread of the edge's points."""
@@ -52,8 +52,8 @@ class Prediction:
         return float(np.sqrt(max(float(off @ np.linalg.solve(self.covariance, off)), 0.0)))
 
 
-class Ways:
-    """Accepted edges laid out once, for many predictions."""
+class EdgeChains:
+    """The graph of accepted edges, from which many relations are predicted."""
 
     def __init__(self, edges: Iterable[Edge], settings: ChainSettings) -> None:
         self._settings = settings
@@ -62,8 +62,8 @@ class Ways:
             self._near.setdefault(edge.u, []).append((edge.v, edge))
             self._near.setdefault(edge.v, []).append((edge.u, edge))
 
-    def tied_to(self, chunk_id: int) -> set[int]:
-        """Return the chunks that some way leads to, and the chunk itself."""
+    def connected_to(self, chunk_id: int) -> set[int]:
+        """Return the chunks that are connected to a chunk, and the chunk itself."""
         out, queue = {chunk_id}, [chunk_id]
         while queue:
             for k, _ in self._near.get(queue.pop(), ()):
@@ -73,7 +73,7 @@ class Ways:
         return out
 
     def predict(self, u: int, v: int, more: Sequence[Edge] = ()) -> Prediction | None:
-        """Return relation of two chunks along the surest path, `more` edges among them; None where there is no path."""
+        """Return the relation of two chunks along the surest path, `more` edges added; None if there is no path."""
         near = self._near
         if more:
             near = dict(near)

@@ -1,7 +1,7 @@
 """Test a supposed relation of two chunks against all that both saw (not only what it was made from).
 
 A reconstruction model that is shown two look-alike places invents a relation between them, and each side fits it well.
-What it cannot invent is the rest of the two chunks: through a false relation, surfaces of one chunk hang in what the
+What it cannot invent is the rest of the two chunks: through a false relation, surfaces of one chunk lie in what the
 other saw to be empty, and what lands on a surface is a thing of another kind. Both are counted here, both ways.
 """
 

@@ -234,6 +234,6 @@ def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSetti
         length = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
         lean = (normal @ side.up) / np.maximum(length, 1e-12)
         signs.append(np.where(np.abs(lean) > settings.least_lean, np.sign(lean), 0.0))
-    told = signs[0] * signs[1]
-    known = told != 0
-    return max(0.0, float(told[known].mean())) if known.any() else 1.0
+    sign = signs[0] * signs[1]
+    known = sign != 0
+    return max(0.0, float(sign[known].mean())) if known.any() else 1.0

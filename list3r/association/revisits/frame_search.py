@@ -51,7 +51,7 @@ class SearchSettings:
     nearest: int = 256
     """Stored frames looked at for each new one."""
     suppress_frames: int = 20
-    """A pair within so many frames of a better one, on both sides, is the same revisit."""
+    """A pair within this many frames of a better one, on both sides, is the same revisit."""
     per_chunk: int = 24
     """Most candidates of a new chunk."""
     per_pair: int = 2
@@ -183,7 +183,7 @@ def is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> boo
 
 
 def _index(store: Store, chunk_ids: Sequence[int]) -> FrameIndices:
-    """Return index with all of the given chunks in it, read anew where a chunk is no longer the one that was read."""
+    """Return index with all of the given chunks in it, read again where a chunk is no longer the one that was read."""
     wanted = set(chunk_ids)
     checksums = {k: c for k, c in store.chunks.checksums().items() if k in wanted}
     known = store.derived.of(FrameIndices)

@@ -44,7 +44,7 @@ class WindowSettings:
     frames: int = 20
     """Frames of each side (VGGT-Long: 20)."""
     step: int = 1
-    """Every so many posed frames."""
+    """Every this many posed frames."""
     least_confidence: float = 0.2
     """Least confidence m of either side's alignment."""
     rough_pairs: int = 600
@@ -117,7 +117,7 @@ def joint_edge(
 
 
 class _Verdict:
-    """What speaks against a relation; `scores` and `seen` tell of the last one."""
+    """What contradicts a relation; `scores` and `seen` are those of the last one."""
 
     def __init__(
         self, u: Place, v: Place, made_from: tuple[Ints, Ints], objection: Objection | None, settings: WindowSettings

@@ -43,7 +43,7 @@ def write_loop(
 
 def draw_loop(edge: Edge, u: tuple[FrameSamples, Keyframe, Camera], v: tuple[FrameSamples, Keyframe, Camera]) -> Image:
     """Return the both ends of a loop edge with the points of each that the other one sees. RGB, shape (h, w, 3)."""
-    halves, said = [], []
+    halves, descriptions = [], []
     for (mine, keyframe, camera), (other, far, _), S_other_mine in (
         (u, v, edge.S_v_u),
         (v, u, edge.S_v_u.inverse()),
@@ -55,14 +55,18 @@ def draw_loop(edge: Edge, u: tuple[FrameSamples, Keyframe, Camera], v: tuple[Fra
             at = int((n % camera.width + 0.5) * zoom), int((n // camera.width + 0.5) * zoom)
             cv2.circle(picture, at, radius, _KEPT if good else _REMOVED, -1, cv2.LINE_AA)
         halves.append(picture)
-        said.append(f"{int(agrees.sum())} of {len(agrees)}")
+        descriptions.append(f"{int(agrees.sum())} of {len(agrees)}")
     height = max(h.shape[0] for h in halves)
     halves = [np.pad(h, ((0, height - h.shape[0]), (0, 0), (0, 0)), constant_values=255) for h in halves]
     row = np.concatenate([halves[0], np.full((height, 4, 3), 255, np.uint8), halves[1]], axis=1)
     strip = np.full((63, row.shape[1], 3), 255, np.uint8)
     verdict = "accepted" if edge.accepted else "rejected"
     frames = f"frames {u[1].frame_index} and {v[1].frame_index}"
-    texts = f"loop {edge.u}-{edge.v}, {frames}: {verdict}", edge.reason, f"points that agree: {said[0]}, {said[1]}"
+    texts = (
+        f"loop {edge.u}-{edge.v}, {frames}: {verdict}",
+        edge.reason,
+        f"points that agree: {descriptions[0]}, {descriptions[1]}",
+    )
     for line, text in enumerate(texts):
         cv2.putText(strip, text, (6, 17 + 19 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([row, strip])

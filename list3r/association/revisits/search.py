@@ -1,11 +1,14 @@
 """Find loop closures (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
 
-Frame descriptors propose with a relaxed threshold (`frame_search`); the two chunks' instances add s_sem and s_rel
-(`cues`); the likeliest by s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel) are verified by the keyframes' features
-and depth where they have them (`verification`), else by a joint window (`joint_window`), which where networks make the
-chunks is asked also after features failed; and nothing is believed that the way the camera went contradicts (`chain`).
+1. Frame descriptors propose candidates with a relaxed threshold (`frame_search`).
+2. The instances of the two chunks add s_sem and s_rel (`cues`). Candidates are ranked by
+   s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel).
+3. The best are verified by the keyframes' features and depth (`verification`) or, where keyframes have none, by a joint
+   window (`joint_window`). Where networks make the chunks, a joint window is also tried after features failed.
+4. A relation that the chain of accepted edges contradicts is refused (`chain`).
+
 Every candidate becomes an edge, accepted or not, with its scores and the reason. How the weights were chosen:
-docs/decisions/0045.
+docs/decisions/0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as the paper writes it.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from functools import partial
 
 import numpy as np
 
-from list3r.association.revisits.chain import ChainSettings, Prediction, Ways
+from list3r.association.revisits.chain import ChainSettings, EdgeChains, Prediction
 from list3r.association.revisits.constellations.search import ThingSearch, ThingSearchSettings
 from list3r.association.revisits.cross_check import Side
 from list3r.association.revisits.cues import (
@@ -61,17 +64,8 @@ _KEPT_BYTES = 16 << 20
 class RevisitSettings:
     """How revisits are found."""
 
-    instance_cues: bool = True
-    """False: frame similarity alone, at its strict threshold."""
-    verified: bool = True
-    """False: every relation that can be measured is accepted, as in VGGT-Long."""
-    strict: float = 0.85
-    """s_det, in [0, 1], from which frame similarity alone makes a candidate worth a try (VGGT-Long)."""
     lambda_: float = 0.5
-    """Weight of frame similarity in s_loop (the paper gives none)."""
-    least_score: float = 0.7
-    """Least s_loop of a candidate where relations are not verified, unless its frames alone are alike enough. Verified
-    ones are only ranked by it (docs/decisions/0149)."""
+    """Weight of frame similarity in s_loop (the paper gives none), which ranks candidates (docs/decisions/0149)."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
     enough: int = 8
@@ -103,8 +97,8 @@ class RevisitSettings:
 
 
 @dataclass(frozen=True)
-class _Scored:
-    """A candidate with what the instances say of it."""
+class ScoredCandidate:
+    """A candidate with what the instances of its two chunks say."""
 
     candidate: Candidate
     cues: InstanceCues
@@ -123,49 +117,44 @@ def find_loops(
     `joint` reconstructs frames of both places together; without one, chunks are compared by their keyframes alone.
     """
     chosen = settings or RevisitSettings()
-    look = _Lookout(store, chunk_id, chosen)
-    found = _by_frames(store, chunk_id, look, joint, chosen)
-    if not chosen.verified:
-        return found
-    edges = look.unambiguous(found)
-    if chosen.things.enabled and chosen.instance_cues and (told := look.by_things(edges)):
-        edges = look.unambiguous([*found, *told])  # things also tell which of several places that frames say is right
+    search = RevisitSearch(store, chunk_id, chosen)
+    found = _by_frames(store, chunk_id, search, joint, chosen)
+    edges = search.unambiguous(found)
+    if chosen.things.enabled and (by_things := search.by_things(edges)):
+        edges = search.unambiguous([*found, *by_things])  # things can also decide between places that frames propose
     return edges
 
 
 def _by_frames(
-    store: Store, chunk_id: int, look: _Lookout, joint: JointReconstructor | None, chosen: RevisitSettings
+    store: Store, chunk_id: int, search: RevisitSearch, joint: JointReconstructor | None, chosen: RevisitSettings
 ) -> list[Edge]:
-    """Find the loop edges between a chunk and those of which frames look like its own; these may contradict."""
+    """Find the loop edges between a chunk and those with frames that look like its own. The edges may contradict."""
     candidates = find_candidates(store, chunk_id, chosen.search)
     edges: list[Edge] = []
     tried = 0
-    for scored in _ranked(candidates, look, chosen):
+    for scored in ranked(candidates, search, chosen.lambda_):
         accepted = [e for e in edges if e.accepted]
-        c = scored.candidate
-        if c.s_det < chosen.strict and look.unlikely(scored):
-            who, name = ("frames and instances", "s_loop") if chosen.instance_cues else ("the frames", "s_det")
-            edge = look.refused(scored, f"{who} are not alike enough ({name} {scored.score:.2f})")
-        elif chosen.verified and any(e.u == c.u for e in accepted) and not look.wants_another(c.u, accepted):
-            edge = look.refused(scored, "not tried: a better candidate joins the two chunks")
+        u = scored.candidate.u
+        if any(e.u == u for e in accepted) and not search.wants_another(u, accepted):
+            edge = search.refused(scored, "not tried: a better candidate joins the two chunks")
         elif tried >= chosen.verify or len(accepted) >= chosen.enough:
-            edge = look.refused(scored, "not tried: enough better candidates of this chunk were")
+            edge = search.refused(scored, "not tried: enough better candidates of this chunk were tried")
         else:
-            edge = look.verified(scored, joint, accepted)
+            edge = search.verified(scored, joint, accepted)
             tried += 1
-        edges.append(_with_scores(edge, scored))
-    if chosen.verified and (alone := look.alone(edges)) is not None:
-        edges += look.second_looks(alone, {e.frames for e in edges if e.u == alone.u})
-    return look.by_all_keyframes(edges) if chosen.verified and chosen.all_keyframes.chunks else edges
+        edges.append(with_scores(edge, scored))
+    if (alone := search.alone(edges)) is not None:
+        edges += search.second_looks(alone, {e.frames for e in edges if e.u == alone.u})
+    return search.by_all_keyframes(edges) if chosen.all_keyframes.chunks else edges
 
 
-def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSettings) -> list[_Scored]:
-    """Return candidates in order of s_loop, the best one of every pair of chunks before any second one."""
+def ranked(candidates: Sequence[Candidate], search: RevisitSearch, weight: float) -> list[ScoredCandidate]:
+    """Return candidates in order of s_loop with this weight of frame similarity, the best one of every pair of chunks
+    before any second one."""
     out = []
     for candidate in candidates:
-        cues = look.cues(candidate.u) if settings.instance_cues else NO_CUES
-        score = loop_score(candidate.s_det, cues, settings.lambda_) if settings.instance_cues else candidate.s_det
-        out.append(_Scored(candidate, cues, score))
+        cues = search.cues(candidate.u)
+        out.append(ScoredCandidate(candidate, cues, loop_score(candidate.s_det, cues, weight)))
     out.sort(key=lambda s: (-s.score, s.candidate.u, s.candidate.frame_u, s.candidate.frame_v))
     seen: list[int] = []
     turn = []
@@ -175,7 +164,8 @@ def _ranked(candidates: Sequence[Candidate], look: _Lookout, settings: RevisitSe
     return [out[n] for n in sorted(range(len(out)), key=lambda n: (turn[n], n))]
 
 
-def _with_scores(edge: Edge, scored: _Scored) -> Edge:
+def with_scores(edge: Edge, scored: ScoredCandidate) -> Edge:
+    """Return an edge with the scores of its candidate."""
     scores = {
         "cosine": scored.candidate.cosine,
         "s_det": scored.candidate.s_det,
@@ -197,7 +187,7 @@ def _rejected(edge: Edge, why: str) -> Edge:
     return replace(edge, accepted=False, weight=0.0, reason=f"{why} ({edge.reason})")
 
 
-def _tells(keyframe: Keyframe) -> bool:
+def _comparable(keyframe: Keyframe) -> bool:
     """Tell whether a keyframe has local features and depth."""
     return bool(keyframe.depth_small.size) and len(keyframe.keypoints_xy) > 0
 
@@ -209,8 +199,8 @@ class InstanceSets(LruCache[int, tuple[object, InstanceSet]]):
         super().__init__(_KEPT_BYTES, lambda held: held[1].feature.nbytes + held[1].center.nbytes)
 
 
-class _Lookout:
-    """The new chunk, and the stored ones it is compared with, read once each."""
+class RevisitSearch:
+    """The new chunk and the stored ones that it is compared with, each read once."""
 
     def __init__(self, store: Store, chunk_id: int, settings: RevisitSettings) -> None:
         self._store = store
@@ -219,8 +209,8 @@ class _Lookout:
         self._rows = {c.chunk_id: c for c in store.chunks.all()}
         self._sides: dict[int, Side] = {}
         self._cues: dict[int, InstanceCues] = {}
-        self._ways = Ways(store.edges.all(), settings.chain)
-        self._tied = self._ways.tied_to(chunk_id)
+        self._chains = EdgeChains(store.edges.all(), settings.chain)
+        self._connected = self._chains.connected_to(chunk_id)
         self._second_opinions = settings.second_opinions
 
     def cues(self, u: int) -> InstanceCues:
@@ -230,61 +220,54 @@ class _Lookout:
             self._cues[u] = compare_instances(there, here, self._settings.cues)
         return self._cues[u]
 
-    def unlikely(self, scored: _Scored) -> bool:
-        """Tell whether a candidate is not worth a try: instances only rank those that are verified."""
-        if not self._settings.instance_cues:
-            return True
-        return not self._settings.verified and scored.score < self._settings.least_score
-
     def _keyframes(self, c: Candidate) -> tuple[Keyframe, Keyframe]:
         return self._store.keyframes.get(c.u, c.frame_u), self._store.keyframes.get(self._id, c.frame_v)
 
     def by_things(self, found: Sequence[Edge]) -> list[Edge]:
         """Return loop edges by the chunks' things alone, to what frames did not join to the new chunk."""
-        joined = {k for e in found if e.accepted for k in self._ways.tied_to(e.u)}
+        joined = {k for e in found if e.accepted for k in self._chains.connected_to(e.u)}
         revisits = [k for k, row in self._rows.items() if is_revisit(self._rows[self._id], row, self._settings.search)]
         apart = [k for k in revisits if self._apart(k) and k not in joined]
         tied = [] if any(e.accepted for e in found) else [k for k in revisits if not self._apart(k)]
         if not apart and not tied:
             return []
         things = ThingSearch(self._store, self._rows, self._id, self._side, self._settings.things)
-        return things.edges(apart, tied, self._ways, self._settings.chain.most_deviations)
+        return things.edges(apart, tied, self._chains, self._settings.chain.most_deviations)
 
-    def refused(self, scored: _Scored, reason: str) -> Edge:
+    def refused(self, scored: ScoredCandidate, reason: str) -> Edge:
         """Return an edge that is kept only for the record."""
         return no_edge(self._id_of(scored), (self._id, scored.candidate.frame_v), reason)
 
-    def verified(self, scored: _Scored, joint: JointReconstructor | None, found: Sequence[Edge]) -> Edge:
+    def verified(self, scored: ScoredCandidate, joint: JointReconstructor | None, found: Sequence[Edge]) -> Edge:
         """Return the edge of a candidate, by keyframes where they have features and depth, else by a joint window."""
         c = scored.candidate
         u, v = self._rows[c.u], self._rows[self._id]
-        way = None if self._apart(c.u) else self._ways.predict(c.u, self._id, found)
+        chain = None if self._apart(c.u) else self._chains.predict(c.u, self._id, found)
         metric = u.scale_kind == v.scale_kind == "metric"
         later = u.session_id != v.session_id
         known = metric and later  # its scale, and things may have been moved in between
-        objection = partial(self._objection, NO_CUES if known else scored.cues, way)
+        objection = partial(self._objection, NO_CUES if known else scored.cues, chain)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
-        if _tells(keyframe_u) and _tells(keyframe_v):
+        if _comparable(keyframe_u) and _comparable(keyframe_v):
             check = verify if metric else verify_scaled
             edge = check(keyframe_u, keyframe_v, c.u, self._id, settings=self._settings.verification, later=later)
-            edge = _objected(edge, objection) if self._settings.verified else edge
+            edge = _objected(edge, objection)
         if joint is None or (edge is not None and (edge.accepted or not self._second_opinions)):
-            edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is at hand")
+            edge = edge or self.refused(scored, "its keyframes have no features and depth, and no model is available")
         else:
             self._second_opinions -= edge is not None
-            ends = self._place(u, c.frame_u), self._place(v, c.frame_v)
-            edge = joint_edge(joint, *ends, objection if self._settings.verified else None, self._settings.window)
+            edge = joint_edge(joint, *self.ends(c), objection, self._settings.window)
         measured = bool(edge.S_v_u.translation.any())
-        off = {"way": way.deviations(edge.S_v_u)} if way is not None and measured else {}
+        off = {"way": chain.deviations(edge.S_v_u)} if chain is not None and measured else {}
         return replace(edge, scores=edge.scores | off)
 
     def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
-        """Tell whether a chunk that nothing tied to the new one before hangs on a single pair of frames so far."""
+        """Tell whether a single pair of frames is all that joins a chunk to the new one so far."""
         return self._apart(u) and len(accepted) == 1
 
     def alone(self, edges: Sequence[Edge]) -> Edge | None:
-        """Return the accepted edge that ties the new chunk to another session, where no other one speaks for it."""
+        """Return the accepted edge that joins the new chunk to another session, if no other edge supports it."""
         accepted = [e for e in edges if e.accepted]
         session = {k: row.session_id for k, row in self._rows.items()}
         apart = self._settings.second_looks.apart
@@ -297,14 +280,14 @@ class _Lookout:
     def second_looks(self, edge: Edge, known: Container[tuple[int, int] | None]) -> list[Edge]:
         """Return relations of further keyframes of two chunks, until one more is accepted (docs/decisions/0056).
 
-        The edge only says which keyframes are worth it: each pair is compared as if nothing were known.
+        The edge only decides which keyframes are compared: each pair is compared as if nothing were known.
         """
         sides = self._side(edge.u).samples, self._side(self._id).samples
         u, v = (self._store.keyframes.descriptors([k])[0][:, 1].tolist() for k in (edge.u, self._id))
         out: list[Edge] = []
         for frame_u, frame_v in seeing_the_same(edge, sides, (u, v), self._settings.second_looks):
-            scored = _Scored(Candidate(edge.u, frame_u, frame_v, 0.0, 0.0), NO_CUES, 0.0)
-            if (frame_u, frame_v) not in known and all(map(_tells, self._keyframes(scored.candidate))):
+            scored = ScoredCandidate(Candidate(edge.u, frame_u, frame_v, 0.0, 0.0), NO_CUES, 0.0)
+            if (frame_u, frame_v) not in known and all(map(_comparable, self._keyframes(scored.candidate))):
                 out.append(self.verified(scored, None, ()))
             if out and out[-1].accepted:
                 break
@@ -323,11 +306,13 @@ class _Lookout:
             for e, f in itertools.combinations(sure, 2)
             if are_two(e, f, session, s.second_looks.apart) and self._agree(e, f)
         ]
-        if agree and not contradicted(agree[0], self._told_by(agree[0].u), self._told_by(self._id), s.all_keyframes):
+        if agree and not contradicted(
+            agree[0], self._comparable_keyframes(agree[0].u), self._comparable_keyframes(self._id), s.all_keyframes
+        ):
             return list(edges)
         out = list(edges)
         for u in list(dict.fromkeys(metric))[: s.all_keyframes.chunks]:
-            ends = (u, self._told_by(u)), (self._id, self._told_by(self._id))
+            ends = (u, self._comparable_keyframes(u)), (self._id, self._comparable_keyframes(self._id))
             found = place_by_all_keyframes(*ends, s.verification, s.all_keyframes)
             again = {e.frames for e in found}
             rest = [e for e in out if e.u != u or e.frames not in again]
@@ -337,22 +322,22 @@ class _Lookout:
             out = [_rejected(e, why) if (e.u, e.frames) in wrong else e for e in out]
         return out
 
-    def _told_by(self, chunk_id: int) -> list[Keyframe]:
+    def _comparable_keyframes(self, chunk_id: int) -> list[Keyframe]:
         """Return the keyframes of a chunk that have features and depth."""
-        return [f for f in self._store.keyframes.of(chunk_id) if _tells(f)]
+        return [f for f in self._store.keyframes.of(chunk_id) if _comparable(f)]
 
     def _contradicted(self, edge: Edge, found: Sequence[Edge]) -> Edge:
-        """Return an edge, rejected where it disagrees with what the whole of two chunks speaks for."""
+        """Return an edge, rejected if it disagrees with the place that the whole of both chunks supports."""
         if not edge.accepted or not found or self._agree(found[0], edge):
             return edge
-        return _rejected(edge, "the whole of both chunks says otherwise")
+        return _rejected(edge, "the whole of both chunks contradicts it")
 
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
-        """Return the edges without those that join what was apart in more than one way.
+        """Return the edges, with those rejected that join separate components in contradictory ways.
 
-        Where no way leads from one chunk to the other nothing contradicts a false relation but another relation. Each
-        is therefore found without regard to the others; those that agree speak for each other, and where the places
-        that were found are as many again, none is believed: the new chunk waits for one that tells them apart.
+        If no chain of edges leads from one chunk to the other, only another relation can contradict a false one. So
+        each relation is found without regard to the others, and those that agree support each other. If the other
+        places have too many relations (`most_ambiguous`), none is accepted until a later chunk decides.
         """
         across = [k for k, e in enumerate(edges) if e.accepted and self._apart(e.u)]
         if len(across) < 2:
@@ -363,28 +348,32 @@ class _Lookout:
         unsure = len(agree[best]) < self._settings.most_ambiguous * len(others)
         out = list(edges)
         for k in across if others and unsure else others:
-            why = "it fits several places as well" if unsure else "more relations say otherwise"
+            why = "other places fit as well" if unsure else "more relations contradict it"
             out[k] = _rejected(edges[k], why)
         return out
 
     def _agree(self, one: Edge, other: Edge) -> bool:
         """Tell whether two relations of the new chunk can both be true; those to places apart from each other can."""
-        way = self._ways.predict(other.u, self._id, [one])
-        return way is None or way.deviations(other.S_v_u) <= self._settings.chain.most_deviations
+        chain = self._chains.predict(other.u, self._id, [one])
+        return chain is None or chain.deviations(other.S_v_u) <= self._settings.chain.most_deviations
 
     def _apart(self, u: int) -> bool:
-        """Tell whether nothing tied a chunk to the new one before."""
-        return u not in self._tied
+        """Tell whether nothing joined a chunk to the new one before."""
+        return u not in self._connected
 
-    def _objection(self, cues: InstanceCues, way: Prediction | None, S_v_u: Sim3) -> str | None:
-        """Return what the way between the chunks and the layout of their instances say against a relation."""
-        if way is not None and (off := way.deviations(S_v_u)) > self._settings.chain.most_deviations:
-            return f"the way between the chunks contradicts it by {off:.0f} deviations"
+    def _objection(self, cues: InstanceCues, chain: Prediction | None, S_v_u: Sim3) -> str | None:
+        """Return how the chain of edges between the chunks or the layout of instances contradicts a relation."""
+        if chain is not None and (off := chain.deviations(S_v_u)) > self._settings.chain.most_deviations:
+            return f"the chain of edges between the chunks contradicts it by {off:.0f} deviations"
         if len(cues.pairs) >= self._settings.layout_pairs and np.isfinite(cues.log_scale):
             ratio = float(np.exp(abs(np.log(float(S_v_u.scale)) - cues.log_scale)))
             if ratio > self._settings.most_scale_ratio:
                 return f"its scale is {ratio:.1f} times off that of the instances' layout"
         return None
+
+    def ends(self, c: Candidate) -> tuple[Place, Place]:
+        """Return the two places of a candidate."""
+        return self._place(self._rows[c.u], c.frame_u), self._place(self._rows[self._id], c.frame_v)
 
     def _place(self, row: ChunkRow, frame: int) -> Place:
         return Place(row.chunk_id, row.session_id, frame, row.scale_kind == "metric", self._side(row.chunk_id))
@@ -409,5 +398,5 @@ class _Lookout:
             held = kept.put(chunk_id, (key, instance_set(nodes, samples.T_chunk_cam, space, self._settings.cues)))
         return held[1]
 
-    def _id_of(self, scored: _Scored) -> tuple[int, int]:
+    def _id_of(self, scored: ScoredCandidate) -> tuple[int, int]:
         return scored.candidate.u, scored.candidate.frame_u

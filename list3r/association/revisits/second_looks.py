@@ -33,7 +33,7 @@ class FramesApart:
 
 
 def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
-    """Tell whether two relations of two sessions speak for each other.
+    """Tell whether two relations of two sessions support each other.
 
     Those of one pair of chunks do where their frames lie apart, or where one is by frames and the other by things.
     Those of two pairs do not where they share a keyframe: what misled one misleads the other (docs/decisions/0058).

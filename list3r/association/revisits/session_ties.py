@@ -40,7 +40,7 @@ class TieSettings:
     apart: FramesApart = field(default_factory=FramesApart)
     """When relations of the same two chunks are two."""
     sure_features: int = 60
-    """One relation is beyond doubt when so many features agree on it,"""
+    """One relation is beyond doubt when this many features agree on it,"""
     sure_overlap: float = 0.6
     """both sides see this share of the same surfaces,"""
     sure_agreement: float = 0.97
@@ -151,11 +151,11 @@ def _is_held(e: Edge) -> bool:
 
 def _held(e: Edge) -> Edge:
     scores = {k: v for k, v in e.scores.items() if k != "trust"} | {HELD: 1.0}
-    reason = f"held back: no second relation agrees that the two sessions lie so to each other ({e.reason})"
+    reason = f"held back: no second relation supports this placement of the two sessions ({e.reason})"
     return replace(e, accepted=False, weight=0.0, scores=scores, reason=reason)
 
 
 def _released(e: Edge) -> Edge:
     scores = {k: v for k, v in e.scores.items() if k != HELD}
-    reason = e.reason.removeprefix("held back: no second relation agrees that the two sessions lie so to each other (")
+    reason = e.reason.removeprefix("held back: no second relation supports this placement of the two sessions (")
     return replace(e, accepted=True, scores=scores, reason=reason.removesuffix(")"))

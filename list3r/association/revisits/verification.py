@@ -61,7 +61,7 @@ class VerificationSettings:
     seen_through_m: float = 0.03
     """A point is seen through where depth lies further behind it than this and"""
     seen_through_sigmas: float = 3.0
-    """so many deviations of the sensor's noise."""
+    """this many deviations of the sensor's noise."""
     scale_gate: float = 1.5
     """Gate of matched features while the common scale of two chunks is searched, in gates of the features."""
     noise: SensorNoise = field(default_factory=SensorNoise)

@@ -117,10 +117,12 @@ def _relation_of_maps(
     for pair in pairs:
         at_a, at_b = pair.rows.T
         points_b = b.points_cam[pair.b]
-        told = relation(a.points_cam[pair.a][at_a], problem.views[pair.b].xy[at_b], points_b[at_b], camera, settings[1])
-        if told is not None and told.tells_scale:
+        measured = relation(
+            a.points_cam[pair.a][at_a], problem.views[pair.b].xy[at_b], points_b[at_b], camera, settings[1]
+        )
+        if measured is not None and measured.tells_scale:
             T_a, T_b = (Sim3.from_matrix(m.found.T_map_cam[k]) for m, k in ((a, pair.a), (b, pair.b)))
-            found.append((T_a @ told.S_b_a.inverse() @ T_b.inverse(), T_b, float(np.nanmedian(points_b[:, 2]))))
+            found.append((T_a @ measured.S_b_a.inverse() @ T_b.inverse(), T_b, float(np.nanmedian(points_b[:, 2]))))
     votes = [sum(_agree(S, other, T_b, depth, how) for other, _, _ in found) for S, T_b, depth in found]
     best = int(np.argmax(votes)) if votes else 0
     if not votes or votes[best] < max(how.least_agreeing, how.least_share * len(votes)):

@@ -1,4 +1,4 @@
-"""Frames of a map, not neighbours in time, that see the same: proposed by their poses and looks, told by geometry."""
+"""Frames of a map, not neighbours in time, that see the same: proposed by pose and look, decided by geometry."""
 
 from __future__ import annotations
 

@@ -23,13 +23,13 @@ class RevisitPairSettings:
     alike: int = 3
     """and others that look most alike."""
     away: float = 0.05
-    """A place comes back, and is told as a loop, where between the two the camera saw no more than this share of it."""
+    """A place comes back, and counts as a loop, where between the two the camera saw no more than this share of it."""
     least_matches: int = 20
     """Fewest features that two have in common."""
     tells_scale: int = 8
     """Points that both hold, from which they tell the scale."""
     shift: tuple[float, float] = (0.15, 0.04)
-    """Drift that a revisit may tell of: share of the depth, and share of the way between."""
+    """Drift that a revisit may reveal: share of the depth, and share of the way between."""
     turn_rad: tuple[float, float] = (0.05, 0.002)
     """... of the direction: at once, and for each frame between."""
     log_scale: tuple[float, float] = (0.10, 0.004)
@@ -47,11 +47,11 @@ class DriftSettings:
     revisit: tuple[float, float, float] = (0.01, 0.004, 0.02)
     """... and to one that sees the same."""
     gate: float = 3.0
-    """A revisit that is off by so many deviations counts a quarter."""
+    """A revisit that is off by this many deviations counts a quarter."""
     rounds: int = 5
     """Solutions, each with the trust that follows from the one before."""
     least_trust: float = 0.1
-    """Revisits of less trust tell nothing."""
+    """Revisits of less trust say nothing."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class VideoMapSettings:
             steady=4.0, growth=1.7, whole_iterations=10, whole_rounds=1, part_iterations=6, settled=1e-4
         )
     )
-    """Rougher than a chunk's, since all is adjusted afterwards; grown anew only where depth jumps: by 17 in a walk of
+    """Rougher than a chunk's, since all is adjusted afterwards; grown again only where depth jumps: by 17 in a walk of
     wide turns that was bent, by 1.7 at most on redkitchen (decision 0128)."""
     joining: JoiningSettings = field(default_factory=JoiningSettings)
     """Of maps of its parts."""

@@ -29,7 +29,7 @@ from list3r.reconstruction.sfm.two_view import verified_rows
 Array = NDArray[np.float64]
 
 _IDS = 1_000_000
-"""Features of the first frame are numbered from here on; those of every frame have so many numbers."""
+"""Features of the first frame are numbered from here on; those of every frame have this many numbers."""
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,12 @@ def _closed(
     T_map_cam, believed = spread_drift(views, revisits, settings.drift) if revisits else (found.T_map_cam, [])
     kept = {k: problem.views[k] for k in T_map_cam}
     pairs = {p: rows for p, rows in problem.pairs.items() if p[0] in kept and p[1] in kept}
-    told = {}
+    relations = {}
     for r in believed:
         a, b = views[r.a].key, views[r.b].key
         first = [len(problem.views[k].ids) - len(features[k].xy) for k in (a, b)]
-        told[a, b] = common[r.a, r.b] + np.array(first)
-    wider = MapProblem(kept, pairs | told, problem.matched | set(told))
+        relations[a, b] = common[r.a, r.b] + np.array(first)
+    wider = MapProblem(kept, pairs | relations, problem.matched | set(relations))
     closed = adjust(wider, camera, T_map_cam, settings.adjustment)
     if closed is None:
         return found, []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from list3r.batch.work import BatchJob, Outcome
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, check_choice
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,7 @@ def make_engine(name: str, resources: TaskResources, jobs: int | None, address: 
         "local": lambda: _local(resources, jobs),
         "ray": lambda: _ray(resources, jobs, address),
     }
-    if name not in known:
-        raise OptionError(f"--engine {name} is not known; choose one of: {', '.join(known)}")
+    check_choice("--engine", name, known)
     if address is not None and name != "ray":
         raise OptionError(f"--address {address} needs --engine ray")
     if jobs is not None and jobs < 1:

@@ -64,9 +64,9 @@ def _side_by_side(resources: TaskResources) -> int:
 
 def _devices() -> list[str]:
     """Return the GPUs that this process may use. Raises `OptionError` where there is none."""
-    told = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if told is not None:
-        found = [d for d in told.split(",") if d]
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        found = [d for d in visible.split(",") if d]
     else:
         import torch
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from list3r.batch.engines.base import TaskResources
 from list3r.batch.work import BatchJob, Outcome, run_task
+from list3r.memory.errors import first_line
 from list3r.pipeline.workers.cluster import RayCluster
 
 _GIB = 2**30
@@ -43,8 +44,8 @@ class RayEngine:
             try:
                 outcome = self._cluster.result(done)
             except self._cluster.errors.RayError as error:
-                said = next((line for line in str(error).splitlines() if line.strip()), "")
-                outcome = Outcome(job.task, "lost", f"{type(error).__name__}: {said}".rstrip(": "))
+                reason = first_line(error)
+                outcome = Outcome(job.task, "lost", f"{type(error).__name__}: {reason}".rstrip(": "))
             yield outcome
 
     def cancel(self) -> None:

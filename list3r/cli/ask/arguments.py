@@ -68,7 +68,7 @@ class NearArguments:
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None
     id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Distance from this instance.")] = None
     max_distance: Annotated[
-        float | None, typer.Option("--max-distance", help="Only things whose surface is no further than this.")
+        float | None, typer.Option("--max-distance", help="Only things whose surface is at most this far away.")
     ] = None
 
     def origin(self) -> tuple[float, float, float] | None:
@@ -76,7 +76,7 @@ class NearArguments:
         from list3r.memory.errors import OptionError
 
         if self.words is None and self.point is None and self.id is None:
-            raise OptionError("say near what: --point x,y,z, --id ID, or words such as mug")
+            raise OptionError("give what to be near to: --point x,y,z, --id ID, or words such as mug")
         return None if self.point is None else parse_point(self.point, "--point")
 
 

@@ -178,7 +178,7 @@ def _sigma_lines(placed: list[dict[str, Any]], units: str) -> list[str]:
         for c in placed
     ]
     widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-    title = "how surely chunks are placed against the first of their part (one sigma, worst axis)"
+    title = "uncertainty of chunk positions relative to the first chunk of their part (one sigma, worst axis)"
     return [title, *(_row(row, widths, range(1, 4)) for row in [header, *rows])]
 
 

@@ -59,7 +59,7 @@ def list_instances(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
         ),
     ] = None,
     at: Annotated[
@@ -71,12 +71,11 @@ def list_instances(
 
     Example: list3r list house.l3r --min-confidence 0.2
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.errors import check_share
     from list3r.memory.records import FIRST_SCRAP, FIRST_UNLISTED
 
     least = min_confidence or 0.0
-    if not 0.0 <= least <= 1.0:
-        raise OptionError(f"--min-confidence {least:g} must lie between 0 and 1")
+    check_share("--min-confidence", least)
     with open_memory(memory, None if at is not None else min_confidence) as scene:
         found = scene.instances(structure=None if structure else False)
         if at is not None:
@@ -121,7 +120,7 @@ def show(
     ],
     json: JsonOption = False,
 ) -> None:
-    """Show one instance: where it is, how big, when it was seen, and its most telling relation to each other one.
+    """Show one instance: where it is, how big, when it was seen, and its main relation to each other instance.
 
     Example: list3r show house.l3r 12
     """
@@ -141,8 +140,8 @@ def show(
         origin = imported_as(scene.store, instance.id)
     if json:
         related = [vars(r) for r in relations]
-        told = {"relations": related, "aliases": aliases, "observed_as": parts, "imported_as": origin}
-        print_answer([{**instance_dict(instance, track), **label_source(instance, named), **told}], units)
+        extra = {"relations": related, "aliases": aliases, "observed_as": parts, "imported_as": origin}
+        print_answer([{**instance_dict(instance, track), **label_source(instance, named), **extra}], units)
         return
     say(f"{instance.id}  {instance.label or instance.description}")
     count = len({part["chunk"] for part in parts})
@@ -175,7 +174,7 @@ def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
 
 
 def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:
-    """What is told of a moving thing: when, how far, from where to where."""
+    """Fields of a moving thing: when, how far, from where to where."""
     if not len(times_s):
         return [("moved", "seen moving; where it was is not known")]
     way = sum(math.dist(a, b) for a, b in itertools.pairwise(places.tolist()))

@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from list3r.queries.relations import Relations
     from list3r.queries.views.camera import PosedCamera
 
-Count = Annotated[int, typer.Option("-k", help="How many at most.")]
+Count = Annotated[int, typer.Option("-k", help="Most answers.")]
 MinConfidence = Annotated[
     float | None,
     typer.Option(
         "--min-confidence",
-        help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+        help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
     ),
 ]
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
 Label = Annotated[
     str | None,
-    typer.Option("--label", metavar="WORDS", help="Only things whose label or description has one of these given."),
+    typer.Option("--label", metavar="WORDS", help="Only things with one of these words in their label or description."),
 ]
 Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only things of this colour.")]
 MinSize = Annotated[float | None, typer.Option("--min-size", help="Only things whose longest edge is at least this.")]
@@ -59,7 +59,7 @@ Pose = Annotated[
     ),
 ]
 SessionOption = Annotated[int | None, typer.Option("--session", help="The session of the frame or camera.")]
-MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="The camera sees no further than this.")]
+MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="How far the camera sees.")]
 
 
 def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | None:

@@ -21,7 +21,7 @@ def picture(
     whole: Annotated[bool, typer.Option("--whole", help="The whole frame with its outline instead of a crop.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Write the stored picture that shows an instance best: most of it, unhidden, and large.
+    """Write the stored picture that shows an instance best: large, complete and not hidden.
 
     Example: list3r picture house.l3r 12 --out mug.jpg
     """
@@ -38,7 +38,7 @@ def picture(
     with replacing(out) as temporary:
         Image.fromarray(found.marked() if whole else found.crop()).save(temporary, quality=92)
     if json:
-        told = {"id": found.instance_id, "session": found.session_id, "frame": found.frame_index}
-        print_answer([{**told, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)}])
+        fields = {"id": found.instance_id, "session": found.session_id, "frame": found.frame_index}
+        print_answer([{**fields, "box_xyxy": found.box_xyxy, "followed": found.mask is not None, "path": str(out)}])
     else:
         say(f"{out}  frame {found.frame_index} of session {found.session_id}, {found.visible_fraction:.0%} visible")

@@ -95,7 +95,7 @@ def similar(
 
     with open_memory(memory, filters.min_confidence) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
-            raise OptionError("say what to compare with: --id ID, or --image FILE, with --box for a part of it")
+            raise OptionError("give what to compare with: --id ID, or --image FILE, with --box for a part of it")
         if like.image is not None:
             found = scene.similar_to_picture(like.image, k, box_xyxy=like.corners(), **filters.options())
         else:
@@ -109,7 +109,7 @@ def find(
     text: Annotated[
         str,
         typer.Argument(
-            metavar="TEXT", help="Description of the thing, and how it stands to others.", show_default=False
+            metavar="TEXT", help="Description of the thing and its relations to others.", show_default=False
         ),
     ],
     k: Count = 5,
@@ -119,7 +119,7 @@ def find(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """The things that a text describes by attributes, a noun and relations; an id may stand for a thing.
+    """The things that a text describes by attributes, a noun and relations; an id can stand for a thing.
 
     Example: list3r query find house.l3r "white mug on table"
     """
@@ -186,7 +186,7 @@ def path(
     memory: MemoryArgument,
     start: Annotated[int, typer.Argument(metavar="ID", help="First instance.", show_default=False)],
     end: Annotated[int, typer.Argument(metavar="ID", help="Second instance.", show_default=False)],
-    structure: Annotated[bool, typer.Option(help="Let the path lead over floor and walls.")] = True,
+    structure: Annotated[bool, typer.Option(help="Allow paths over floor and walls.")] = True,
     json: JsonOption = False,
 ) -> None:
     """The shortest chain of relations from one instance to another.

@@ -87,7 +87,7 @@ def batch(
     run: Annotated[RunOptions, _RUN],
     json: JsonOption = False,
 ) -> None:
-    """Build the memories of many videos, one task per video. Run again, it does only what is not done yet.
+    """Build the memories of many videos, one task per video. Running it again does only what is not done yet.
 
     Example: list3r batch walks/ --out memories/
     """
@@ -112,15 +112,18 @@ def batch(
         if tasks.element is not None:
             if not 0 <= tasks.element < len(groups):
                 raise OptionError(f"--only {tasks.element}: the memories are numbered 0 to {len(groups) - 1}")
-            report = run_here(groups[tasks.element], settings, _told(json))
+            report = run_here(groups[tasks.element], settings, _outcome_printer(json))
         else:
             report = run_batch(
-                groups, make_engine(place.engine, resources, place.jobs, place.address), settings, _told(json)
+                groups,
+                make_engine(place.engine, resources, place.jobs, place.address),
+                settings,
+                _outcome_printer(json),
             )
     except KeyboardInterrupt:
         note("", "interrupted; finished memories stay; give the same command again to continue")
         raise typer.Exit(1) from None
-    _say(report, json)
+    _print_report(report, json)
     if report.failed:
         raise typer.Exit(1)
 
@@ -132,18 +135,18 @@ def _read(videos: str, given: src.SourceArguments, request: BuildRequest, run: R
     return read_tasks(videos, Asked(lambda fields: replace(given, **fields).options(), request, run))
 
 
-def _told(quiet: bool) -> Any:
-    """Return what says how tasks end, one line each on standard error."""
+def _outcome_printer(quiet: bool) -> Any:
+    """Return what prints how each task ended, one line on standard error."""
 
-    def told(outcome: Outcome, settled: int, total: int) -> None:
+    def print_outcome(outcome: Outcome, settled: int, total: int) -> None:
         o = outcome
         result = f"{o.frames} frames, {o.instances} things" if o.built else o.reason
         note(f"[{settled}/{total}] {o.task.memory}: {o.state}, {result} ({o.seconds:.1f} s)")
 
-    return (lambda outcome, settled, total: None) if quiet else told
+    return (lambda outcome, settled, total: None) if quiet else print_outcome
 
 
-def _say(report: BatchReport, json: bool) -> None:
+def _print_report(report: BatchReport, json: bool) -> None:
     if json:
         print_answer([report.as_dict()])
         return

@@ -25,21 +25,21 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     _check_numbers(seed=seed, frames=frames, workers=workers)
     make_folder(out)
     walk, memory = out / "walk", out / "rooms.l3r"
-    _say(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
+    _print(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
     _render(walk, seed=seed, frames=frames, workers=workers, quiet=quiet)
-    _say(quiet, f"\n2. list3r build {walk} -m {memory} --poses estimate")
+    _print(quiet, f"\n2. list3r build {walk} -m {memory} --poses estimate")
     from list3r.pipeline.build import build
 
     request, run = BuildRequest(poses="estimate"), RunOptions(workers=workers, resume=memory.exists())
     interrupted = build_interrupted(memory, run.resume)
     with watching("building", interrupted, quiet=quiet, notes=False) as watch:
         report = build(walk, memory, settings=request, run=run, watch=watch)
-    _say(quiet, "\n".join(report_lines(memory, report)))
+    _print(quiet, "\n".join(report_lines(memory, report)))
     with open_memory(memory) as scene:
         _ask(scene, memory, quiet)
         written = _export(scene, out, quiet)
         scores = _score(out, walk, quiet)
-    _say(quiet, f"\nThe picture to look at: {written['plan']}")
+    _print(quiet, f"\nThe picture to look at: {written['plan']}")
     return {"memory": str(memory), "walk": str(walk), "build": report.as_dict(), "exports": written, "scores": scores}
 
 
@@ -97,13 +97,13 @@ def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
 
 
 def _export(scene: SceneMemory, out: Path, quiet: bool) -> dict[str, str]:
-    _say(quiet, "\n6. exports")
+    _print(quiet, "\n6. exports")
     written = {}
     for name, suffix in EXPORTS:
         path = out / f"rooms.{suffix}"
         scene.export(name, path)
         written[name] = str(path)
-        _say(quiet, f"   {name:5} {path}  {path.stat().st_size / 1e6:.2f} MB")
+        _print(quiet, f"   {name:5} {path}  {path.stat().st_size / 1e6:.2f} MB")
     return written
 
 
@@ -116,7 +116,7 @@ def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
     errors = evaluate_trajectory(truth, estimate)
     S_truth_scene = alignment_of(truth, estimate, with_scale=False)
     scene = evaluate_scene(read_scene(out / "rooms.json"), read_scene(walk / "truth.json"), S_truth_scene)
-    _say(quiet, "\n7. against the known truth")
+    _print(quiet, "\n7. against the known truth")
     if not quiet:
         say(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
         print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
@@ -129,6 +129,6 @@ def _check_numbers(*, seed: int, frames: int | None, workers: int | None) -> Non
             raise OptionError(f"--{name} {value}: at least {least} is needed")
 
 
-def _say(quiet: bool, text: str) -> None:
+def _print(quiet: bool, text: str) -> None:
     if not quiet:
         say(*text.splitlines())

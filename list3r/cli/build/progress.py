@@ -38,15 +38,15 @@ def watching(
                 begun = begun or done > 0
                 bar.show(done, total)
 
-            told = (lambda line: note(f"note: {line}")) if notes and not quiet else None
-            yield Watch(progress, looking(bar, title), told, debug)
+            on_note = (lambda line: note(f"note: {line}")) if notes and not quiet else None
+            yield Watch(progress, looking(bar, title), on_note, debug)
     except KeyboardInterrupt:
         note("", interrupted(begun))
         raise typer.Exit(1) from None
 
 
 def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
-    """Return what moves a progress bar while a video is looked at before its chunks; then it begins anew as `then`."""
+    """Return what moves a progress bar while a video is looked at before its chunks; then it begins again as `then`."""
     now = then
 
     def look(what: str, done: int, total: int) -> None:
@@ -65,7 +65,7 @@ def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
 def say_result(
     memory: Path, work: Callable[[], Report], lines: Callable[[Path, Report], list[str]], json: bool
 ) -> None:
-    """Do the work and print its report. What failed after the memory was written is raised when that is told."""
+    """Do the work and print its report. What failed after the memory was written is raised after that is printed."""
     from list3r.pipeline.finishing import FinishingError
 
     failure = None
@@ -74,12 +74,12 @@ def say_result(
     except FinishingError as error:
         report, failure = cast(Report, error.report), error
     if json:
-        told = {"memory": str(memory), **report.as_dict()}
-        del told["notes"]
+        result = {"memory": str(memory), **report.as_dict()}
+        del result["notes"]
         failed: dict[str, Any] = {}
         if failure is not None:
             failed["error"] = {"kind": type(failure).__name__, "message": str(failure), "status": 2}
-        print_answer([told], notes=report.notes, **failed)
+        print_answer([result], notes=report.notes, **failed)
     else:
         say(*lines(memory, report))
     if failure is not None and json:
@@ -107,7 +107,7 @@ def build_interrupted(memory: Path, resumed: bool) -> Callable[[bool], str]:
 
     def said(begun: bool) -> str:
         if (begun or resumed) and memory.exists():
-            return f"interrupted; {memory} keeps the finished chunks: go on with the same command and --resume"
+            return f"interrupted; {memory} keeps the finished chunks: continue with the same command and --resume"
         return "interrupted before a chunk was finished; nothing was changed"
 
     return said

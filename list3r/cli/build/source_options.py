@@ -66,7 +66,7 @@ Fps = Annotated[
     typer.Option(
         "--fps",
         metavar="RATE",
-        help="Frames to take per second; for a source without a clock, the rate it was filmed at.",
+        help="Take this many frames per second; for a source without time stamps, the rate at which it was filmed.",
     ),
 ]
 Start = Annotated[

@@ -109,7 +109,7 @@ def check(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
     else:
         print_table([[e.name, e.revision, e.instances, e.path] for e in stale], _HEADER)
     if stale:
-        note(f"{len(stale)} changed or gone; `list3r catalog add FILE` adds the present file")
+        note(f"{len(stale)} changed or gone; `list3r catalog add FILE` adds the current file")
         raise typer.Exit(1)
 
 

@@ -1,4 +1,4 @@
-"""The questions of `query` asked of a catalogue: `--catalog URL`, in one memory or over all."""
+"""The questions of `query` for a catalogue: `--catalog URL`, in one memory or over all."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ def _option_error(text: str) -> Exception:
 def _check(name: str, arguments: Arguments, signature: inspect.Signature) -> None:
     """Raise `OptionError` for what is asked that only a file can tell."""
     if asked_at() is not None:
-        raise _option_error("--at cannot be asked of a catalogue; leave it out, or ask the memory file")
+        raise _option_error("--at is not available for a catalogue; leave it out, or ask the memory file")
     for word, value in arguments.items():
         if word not in _TOLD[name] and value != signature.parameters[word].default:
-            told = word.replace("_", "-")
-            raise _option_error(f"--{told} cannot be asked of a catalogue; leave it out, or ask the memory file")
+            flag = word.replace("_", "-")
+            raise _option_error(f"--{flag} is not available for a catalogue; leave it out, or ask the memory file")
 
 
 def _ask(url: str, name: str, memory: str | None, arguments: Arguments, json: bool) -> None:
@@ -105,11 +105,11 @@ def _one(memory: str | None) -> str:
 
 
 def _nearest(catalog: Catalog, memory: str | None, arguments: Arguments, filters: CatalogFilters) -> CatalogAnswers:
-    point, near, told = arguments["point"], arguments["id"], arguments["words"]
-    if told is not None and (point is not None or near is not None):
+    point, near, words = arguments["point"], arguments["id"], arguments["words"]
+    if words is not None and (point is not None or near is not None):
         raise _option_error("a catalogue takes words or a place, not both; leave one out")
-    if told is not None:
-        return catalog.find(told, memory, k=arguments["k"], filters=filters)
+    if words is not None:
+        return catalog.find(words, memory, k=arguments["k"], filters=filters)
     at = None if point is None else parse_point(point, "--point")
     return catalog.nearest(_one(memory), point=at, instance_id=near, k=arguments["k"], filters=filters)
 

@@ -25,7 +25,7 @@ AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", he
 def merges(
     memory: MemoryArgument,
     instance_id: Annotated[
-        int | None, typer.Argument(metavar="[ID]", help="Only what concerns this instance.", show_default=False)
+        int | None, typer.Argument(metavar="[ID]", help="Only entries about this instance.", show_default=False)
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -88,7 +88,7 @@ def merge(
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say that two instances are one thing: the older id stays, the other resolves to it for ever.
+    """Merge two instances that are one thing: the older id stays, and the other resolves to it from then on.
 
     Example: list3r merge house.l3r 12 31
     """
@@ -104,13 +104,13 @@ def split(
             "--out",
             metavar="CHUNK:LOCAL,...",
             help="Local instances that leave it (see `observed_as` of `list3r show --json`); "
-            "default: split where the evidence does.",
+            "default: the split that the evidence supports best.",
         ),
     ] = None,
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Say that an instance is two things: the larger part keeps the id.
+    """Split an instance that is two things: the larger part keeps the id.
 
     Example: list3r split house.l3r 12 --out 3:4,5:2
     """
@@ -151,10 +151,10 @@ def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool
         print_answer([report.as_dict()], units)
         return
     say(f"{report.text} (entry {report.entry})")
-    told = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]
-    told += [f"#{old} resolves to #{new}" for old, new in report.aliases]
-    if told:
-        say("; ".join(told))
+    lines = [f"#{n} is new" for n in report.new] + [f"#{n} is back" for n in report.restored]
+    lines += [f"#{old} resolves to #{new}" for old, new in report.aliases]
+    if lines:
+        say("; ".join(lines))
 
 
 def _parse_parts(text: str) -> list[tuple[int, int]]:

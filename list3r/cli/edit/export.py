@@ -78,7 +78,7 @@ def export(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, also scraps, which are not listed otherwise.",
+            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
         ),
     ] = None,
     json: JsonOption = False,
@@ -103,9 +103,9 @@ def export(
     if json:
         print_answer({"format": to, "path": path, "bytes": size} for path, size in sizes.items())
     elif find_format(to).folder:
-        say(f"{out}  {len(sizes)} file{'s' * (len(sizes) != 1)}, {_told(sum(sizes.values()))}")
+        say(f"{out}  {len(sizes)} file{'s' * (len(sizes) != 1)}, {_size_text(sum(sizes.values()))}")
     else:
-        say(*(f"{path}  {_told(size)}" for path, size in sizes.items()))
+        say(*(f"{path}  {_size_text(size)}" for path, size in sizes.items()))
 
 
 @contextlib.contextmanager
@@ -115,7 +115,7 @@ def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Any]]:
         yield {"progress": bar.show} if "progress" in find_format(to).options else {}
 
 
-def _told(size: int) -> str:
+def _size_text(size: int) -> str:
     return f"{size / 1e6:.2f} MB" if size >= 1e4 else f"{size / 1e3:.1f} kB"
 
 

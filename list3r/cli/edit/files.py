@@ -39,7 +39,7 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         say(f"`list3r repair {memory}` saves what is sound")
     else:
         unfinished = (
-            "; the build is unfinished, go on with --resume" if any(s["state"] == "building" for s in state) else ""
+            "; the build is unfinished, continue with --resume" if any(s["state"] == "building" for s in state) else ""
         )
         say(f"{memory} is sound: {chunks} chunks{unfinished}")
     if beside and not json:
@@ -94,7 +94,7 @@ def repair(
 
 
 def doctor(json: JsonOption = False) -> None:
-    """Say what is installed, what is missing, and what that means.
+    """Check what is installed, what is missing, and what does not work without it.
 
     Example: list3r doctor
     """

@@ -52,7 +52,7 @@ class CloudArguments:
         typer.Option("--path", metavar="TRAJECTORY", help="Camera path of the estimate, if it is not a memory."),
     ] = None
     scale: ScaleOption = "auto"
-    threshold: Annotated[float, typer.Option("--threshold", help="Distance of the F-score, metres.")] = 0.05
+    threshold: Annotated[float, typer.Option("--threshold", help="Distance threshold of the F-score, metres.")] = 0.05
     truncate: Annotated[
         float | None, typer.Option("--truncate", help="Cap each distance at this, metres; default: no cap.")
     ] = None
@@ -145,23 +145,23 @@ def _cloud_alignment(
     chosen = asked.align or (["path"] if by_source else ["none"])
     free = free_scale(asked.scale, estimate_path)
     kind = "Sim(3)" if free else "SE(3)"
-    S, said = Sim3.identity(), []
+    S, steps = Sim3.identity(), []
     for word in chosen:
         if word == "none":
             continue
         if word == "icp":
             near = found.moved(S).points
             S = register(true.points, _normals(true), near, with_scale=free, settings=IcpSettings()) @ S
-            said.append(f"{kind} by point-to-plane ICP")
+            steps.append(f"{kind} by point-to-plane ICP")
             continue
         if not is_memory(estimate_path) and not estimate_path.suffix.lower() == ".txt":
             raise OptionError(f"--align {word}: {estimate_path} has no camera path; give one with --path")
         goal = true_path if by_source and true_path is not None else read_trajectory(Path(word))
         S = alignment_of(goal, read_trajectory(estimate_path), with_scale=free)
-        said.append(f"{kind} by the camera's path")
-    if not said:
+        steps.append(f"{kind} by the camera's path")
+    if not steps:
         return S, "not: both lie in one frame of reference"
-    return S, f"{', then '.join(said)}; scale {float(S.scale):.4f}"
+    return S, f"{', then '.join(steps)}; scale {float(S.scale):.4f}"
 
 
 def _normals(points: PointCloud) -> Any:

@@ -42,9 +42,11 @@ class TrajectoryArguments:
     """How poses are associated and placed."""
 
     delta: Annotated[
-        str, typer.Option("--delta", help="Distance of the poses that RPE relates: 10 (frames), 0.5m or 2s.")
+        str, typer.Option("--delta", help="Distance between the poses that RPE compares: 10 (frames), 0.5m or 2s.")
     ] = "1"
-    tolerance: Annotated[float, typer.Option("--tolerance", help="Greatest gap of associated times, seconds.")] = 0.01
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Largest time difference of associated poses, seconds.")
+    ] = 0.01
     scale: Annotated[
         str,
         typer.Option(
@@ -126,7 +128,7 @@ class InstanceArguments:
         typer.Option(
             "--ids",
             metavar="FOLDER",
-            help="Folder of pictures of true ids, for id switches of a memory. Default: ids/ beside TRUTH.",
+            help="Folder with images of true ids, to count the id switches of a memory. Default: ids/ beside TRUTH.",
         ),
     ] = None
     every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1

@@ -10,6 +10,7 @@ import sqlite3
 import tempfile
 from importlib import metadata
 
+from list3r.memory.errors import first_line
 from list3r.models.cache import cache_folder, find_cached
 from list3r.models.cards import CARDS, ModelCard
 from list3r.models.device import find_gpu
@@ -70,7 +71,7 @@ def _gpu() -> tuple[str, str, str]:
     except ImportError:
         return "GPU", "unknown, torch is absent", use
     except RuntimeError as error:
-        return "GPU", f"cannot be used: {str(error).splitlines()[0][:80]}", use
+        return "GPU", f"cannot be used: {first_line(error)}", use
     if gpu is None:
         return "GPU", "none", use
     return "GPU", f"{gpu.name}, {gpu.free_mb / 1024:.1f} of {gpu.total_mb / 1024:.1f} GB free", use

@@ -114,12 +114,12 @@ def _check_clock(path: Path, frame: Any, time_s: Any, times: dict[int, float]) -
     if not gaps:
         span = f"{min(times)} to {max(times)}" if times else "none"
         raise OptionError(
-            f"{path}: none of its {len(frame)} frames is in the memory, which has {span}; is it the source?"
+            f"{path}: none of its {len(frame)} frames is in the memory, which has {span}; is it its source?"
         )
     if float(np.median(gaps)) > 0.05:
         raise OptionError(
-            f"{path}: frames of one number are {float(np.median(gaps)):.2f} s apart in it and in the memory; is it the "
-            "source?"
+            f"{path}: frames with the same number are {float(np.median(gaps)):.2f} s apart in it and in the memory; is "
+            "it the source of the memory?"
         )
 
 

@@ -83,8 +83,8 @@ def fetch_model(
         cached = fetch(weights, revision)
         done.append({"weights": cached.name, "folder": str(cached.folder), "bytes": cached.size_bytes})
         if not json:
-            said = "was there" if before is not None and before.commit == cached.commit else "fetched"
-            say(f"{cached.name}  {cached.size_bytes / 1e6:.1f} MB  {said}: {cached.folder}")
+            outcome = "was there" if before is not None and before.commit == cached.commit else "fetched"
+            say(f"{cached.name}  {cached.size_bytes / 1e6:.1f} MB  {outcome}: {cached.folder}")
     if json:
         print_answer(done)
 

@@ -26,7 +26,7 @@ def embed(
     run: Annotated[RunOptions, only("licence")],
     json: JsonOption = False,
 ) -> None:
-    """Describe every thing by a text-image model, so that free words find it.
+    """Embed every thing with a text-image model, so that any words can find it.
 
     Example: list3r embed house.l3r --model siglip2
     """

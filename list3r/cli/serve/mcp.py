@@ -52,7 +52,7 @@ def mcp(
             return
         settings = HttpSettings(port, os.environ.get(TOKEN_VARIABLE, ""))
         try:
-            serve_http(served, settings, _say)
+            serve_http(served, settings, _print_address)
         except KeyboardInterrupt:
             note("stopped")
 
@@ -67,7 +67,7 @@ def _opened(memory: Path | None, catalog: str | None, *, write: bool) -> SceneMe
     return Catalog.open(catalog, _CONNECTIONS, make=False)
 
 
-def _say(address: str, token: str) -> None:
+def _print_address(address: str, token: str) -> None:
     shown = f"the token of {TOKEN_VARIABLE}" if os.environ.get(TOKEN_VARIABLE) else token
     note(address)
     note(f"Authorization: Bearer {shown}")

@@ -35,7 +35,7 @@ def view(
         viewers = [Viewer(scene, ViewerSettings(min(port + k, 65535))) for k, scene in enumerate(scenes)]
         address = viewers[0].address
         if len(viewers) > 1:
-            from list3r.viewer.beside import SideBySide
+            from list3r.viewer.side_by_side import SideBySide
 
             beside = SideBySide([(v.memory.path.name, v.address) for v in viewers])
             stack.callback(beside.stop)

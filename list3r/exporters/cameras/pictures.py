@@ -84,7 +84,7 @@ def jpeg_size(content: bytes) -> tuple[int, int] | None:
 def colored_points(
     store: Store, component: Component, per_instance: int = 2000
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return surface points of all instances, at most so many of each, and their colours. Shapes (N, 3), (N, 3)."""
+    """Return surface points of all instances, at most this many of each, and their colours. Shapes (N, 3), (N, 3)."""
     supports = [thinned_support(store, i, per_instance) for i in component.instances]
     points = np.concatenate([*(s.points for s in supports), np.zeros((0, 3))])
     return points, np.concatenate([*(s.rgb for s in supports), np.zeros((0, 3), np.uint8)]).astype(np.uint8)

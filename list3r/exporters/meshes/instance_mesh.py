@@ -32,9 +32,9 @@ class MeshSettings:
     convex_depth: float = 0.06
     """A point so deep under the convex hull still lies on it: noise, and the roundness of sides."""
     convex_share: float = 0.85
-    """With so many points on the hull, the hull is the better mesh: what nobody saw is closed straight."""
+    """With this many points on the hull, the hull is the better mesh: what nobody saw is closed straight."""
     convex_sides: float = 0.6
-    """And where so much of its area bears points, of two opposite sides the better: under a table nothing does."""
+    """And where so much of its area has points, of two opposite sides the better: under a table nothing does."""
     hull_faces: int = 10_000
     """Of a hull, at most; more of them show colours finer."""
     faces_a_point: int = 8
@@ -92,7 +92,7 @@ def _dense(points: Array) -> NDArray[np.bool_]:
 
 
 def _hull(points: Array, axes_world: Array, s: MeshSettings) -> ClosedSurface | None:
-    """Return the convex hull where nearly all points lie on it and its sides bear points."""
+    """Return the convex hull where nearly all points lie on it and its sides have points."""
     size = float(np.ptp(points, axis=0).max())
     _, spread, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if spread[2] < 0.01 * spread[0]:
@@ -115,15 +115,15 @@ def _hull(points: Array, axes_world: Array, s: MeshSettings) -> ClosedSurface | 
 
 
 def _borne_sides(surface: ClosedSurface, points: Array, axes_world: Array, reach: float) -> float:
-    """Return the share of the area of a hull that bears points, of two opposite sides that which bears more."""
+    """Return the share of the area of a hull that has points, of two opposite sides that which has more."""
     corners = surface.vertices[surface.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ axes_world
     area = np.linalg.norm(across, axis=1)
     axis = np.abs(across).argmax(axis=1)
     side = 2 * axis + (across[np.arange(len(axis)), axis] > 0)
-    borne = cKDTree(points).query(corners.mean(axis=1))[0] < reach
-    areas, borne_areas = np.bincount(side, area, 6), np.bincount(side, area * borne, 6)
-    share = (borne_areas / np.maximum(areas, 1e-30)).reshape(3, 2).max(axis=1)
+    covered = cKDTree(points).query(corners.mean(axis=1))[0] < reach
+    areas, covered_areas = np.bincount(side, area, 6), np.bincount(side, area * covered, 6)
+    share = (covered_areas / np.maximum(areas, 1e-30)).reshape(3, 2).max(axis=1)
     return float(share @ areas.reshape(3, 2).sum(axis=1) / areas.sum())
 
 

@@ -31,7 +31,7 @@ class PlanFrame:
     """What is up in the picture."""
 
     def reduced(self, times: int) -> PlanFrame:
-        """Return the same view in so many times fewer pixels each way."""
+        """Return the same view in this many times fewer pixels each way."""
         width, height = self.size_px
         return replace(self, pixels_per_unit=self.pixels_per_unit / times, size_px=(width // times, height // times))
 

@@ -32,11 +32,11 @@ class PlanSettings:
     wide: float = 0.62
     """A scene whose height on the page is under this share of its width has the legend below."""
     points_per_instance: int = 8000
-    """At most so many points of each thing are drawn."""
+    """At most this many points of each thing are drawn."""
     points_of_instances: int = 10_000_000
-    """At most so many points of all things together, the same share of each: more than a page has pixels."""
+    """At most this many points of all things together, the same share of each: more than a page has pixels."""
     points_per_structure: int = 40000
-    """At most so many points of a floor, a wall and the like."""
+    """At most this many points of a floor, a wall and the like."""
 
     def __post_init__(self) -> None:
         least = self.legend_px + 3 * self.margin_px + 300

@@ -110,7 +110,7 @@ def _legend_column(sheet: Sheet, rows: list[Instance], unit: str, x: float, y: f
 
 
 def seen_most(things: list[Instance], limit: int) -> list[Instance]:
-    """Return at most so many things, those with the most observations, by id."""
+    """Return at most this many things, those with the most observations, by id."""
     return sorted(sorted(things, key=lambda i: (-i.observations, i.id))[:limit], key=lambda i: i.id)
 
 

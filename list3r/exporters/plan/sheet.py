@@ -20,7 +20,7 @@ from list3r.memory.records import Instance
 INK: Color = (38, 42, 52)
 GREY: Color = (120, 124, 134)
 OVERSAMPLING = 2
-"""Drawn so many times larger and averaged down: Pillow does not smooth its lines."""
+"""Drawn this many times larger and averaged down: Pillow does not smooth its lines."""
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 
@@ -109,9 +109,9 @@ class Sheet:
 
     def name(self, instance: Instance) -> str:
         """Return the label of an instance; where there is none, or the font lacks its letters, its description."""
-        label, told = shown(instance.label or ""), shown(instance.description)
+        label, description = shown(instance.label or ""), shown(instance.description)
         lacking = self.vector is None and plain_text(label).count("?") > label.count("?")
-        return told if not label or (lacking and told) else label
+        return description if not label or (lacking and description) else label
 
     def chip_width(self, instance_id: int) -> float:
         """Return the width of the tag of an id, px."""

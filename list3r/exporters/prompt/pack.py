@@ -63,7 +63,7 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
         memory.export("plan", temporary / "map.png")
         views = _write_views(memory, temporary / "views", listed, settings)
         crops = _write_crops(memory, temporary / "crops", listed)
-        told = {
+        manifest = {
             "format": "list3r-prompt",
             "version": 1,
             "memory": memory.path.name,
@@ -73,7 +73,7 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
             "views": views,
             "without_picture": sorted(set(listed) - crops),
         }
-        (temporary / _OURS).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        (temporary / _OURS).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     return tuple(sorted(p for p in folder.rglob("*") if p.is_file()))
 
 

@@ -37,7 +37,7 @@ class PromptSettings:
     share_of_counts: float = 0.5
     """Counts take at most this share of what the rows have left."""
     neighbours: int = 2
-    """Nearest things that are told of each thing."""
+    """Nearest things that are listed for each thing."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class ScenePrompt:
 def scene_prompt(
     memory: SceneMemory, tokens: int = 2000, question: str | None = None, settings: PromptSettings | None = None
 ) -> ScenePrompt:
-    """Return the text of a memory in at most so many tokens, see `SceneMemory.prompt`."""
+    """Return the text of a memory in at most this many tokens, see `SceneMemory.prompt`."""
     settings = settings or PromptSettings()
     things = [i for i in memory.instances(structure=None) if i.state != "removed"]
     ranked = ranked_instances(memory, things, question)
@@ -217,15 +217,15 @@ class _SceneWriter:
 
     def gaps(self, budget: Budget, listed: Sequence[Instance]) -> None:
         """Add the nearest things of each listed thing with the gap between their surfaces."""
-        items, told, cost = [], set[frozenset[int]](), 0
+        items, written, cost = [], set[frozenset[int]](), 0
         for i in listed:
             if i.structure is not None or cost > budget.left:
                 continue
             near = []
             for m in self.memory.nearest(i.id, k=self.settings.neighbours):
                 pair = frozenset((i.id, m.instance.id))
-                if m.distance_m is not None and pair not in told:
-                    told.add(pair)
+                if m.distance_m is not None and pair not in written:
+                    written.add(pair)
                     near.append(f"{m.instance.id} {self.number(m.distance_m)}")
             if near:
                 items.append(f"{i.id}: {', '.join(near)}")
@@ -237,11 +237,11 @@ class _SceneWriter:
         """Add further relations between listed things, the surest first."""
         shown = {i.id for i in listed}
         for predicate in _TOLD:
-            told, items = set[frozenset[int]](), []
+            written, items = set[frozenset[int]](), []
             for r in self.stored:
                 pair = frozenset((r.subject, r.object))
-                if r.predicate == predicate and {r.subject, r.object} <= shown and pair not in told:
-                    told.add(pair)
+                if r.predicate == predicate and {r.subject, r.object} <= shown and pair not in written:
+                    written.add(pair)
                     items.append(f"{r.subject} {r.object}")
             if items:
                 budget.add_list(f"{predicate.replace('_', ' ')}:".capitalize(), items)

@@ -10,7 +10,7 @@ _LETTERS = 5
 
 
 def count_tokens(text: str) -> int:
-    """Return a count of tokens that the byte pair encodings in use seldom exceed.
+    """Return a count of tokens that the byte pair encodings in use rarely exceed.
 
     A word is a token for each five letters begun, a number one for each digit and one for the space before it, any
     other sign one for each byte, a line break and a stretch of other white space one. `docs/prompt.md` has the counts

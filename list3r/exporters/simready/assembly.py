@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from list3r.exporters.components import has_box, read_components
 from list3r.exporters.meshes.instance_mesh import InstanceMesh, instance_mesh
 from list3r.exporters.output import replacing_folder, units
-from list3r.exporters.simready.making import Making, write_props
+from list3r.exporters.simready.processes import Making, write_props
 from list3r.exporters.simready.prop import Prop, PropFacts
 from list3r.exporters.usd.labels import set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind
@@ -26,7 +26,7 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class SimreadySettings:
-    """What props are told to be, and how they are made."""
+    """What is written about props, and how they are made."""
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for no mass and no rigid body."""
@@ -67,7 +67,7 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
         props = write_props(store, things, temporary, facts, making)
         if settings.ids is not None and len(props) < len(things):
             bare = sorted({i.id for i in things} - {p.instance_id for p in props})
-            raise OptionError(f"{_told(bare)}: too few surface points for a mesh; leave it out of the ids")
+            raise OptionError(f"{_names_of(bare)}: too few surface points for a mesh; leave it out of the ids")
         fixed = [(i, mesh) for i in structure if (mesh := instance_mesh(store, i)) is not None]
         scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
         _fill_scene(Usd.Stage.Open(scene), props, fixed)
@@ -86,12 +86,12 @@ def _chosen(store: Store, settings: SimreadySettings) -> tuple[list[Instance], l
     if settings.ids is not None:
         wanted = {store.instances.get(n).id for n in settings.ids}
         if bare := sorted(wanted - {i.id for i in things}):
-            raise OptionError(f"{_told(bare)}: structure, gone, moving or placed apart; leave it out of the ids")
+            raise OptionError(f"{_names_of(bare)}: structure, gone, moving or placed apart; leave it out of the ids")
         things = [i for i in things if i.id in wanted]
     return things, [i for i in there if i.structure is not None]
 
 
-def _told(ids: Sequence[int]) -> str:
+def _names_of(ids: Sequence[int]) -> str:
     return ", ".join(f"#{n}" for n in ids[:10]) + (f" and {len(ids) - 10} more" if len(ids) > 10 else "")
 
 

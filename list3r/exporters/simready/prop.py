@@ -108,7 +108,7 @@ def _stage(name: str, instance: Instance, mesh: InstanceMesh, T_world_prop: Sim3
         root.CreateAttribute("list3r:mass:estimated", Sdf.ValueTypeNames.Bool, custom=True).Set(True)
         root.CreateAttribute("list3r:mass:density", Sdf.ValueTypeNames.Double, custom=True).Set(facts.density_kg_m3)
     extents = np.ptp(np.asarray(body.GetPointsAttr().Get()), axis=0)
-    told = {
+    metadata = {
         "author": "list3r",
         "asset_name": name,
         "asset_type": "prop",
@@ -121,5 +121,5 @@ def _stage(name: str, instance: Instance, mesh: InstanceMesh, T_world_prop: Sim3
         "asset_extents": Gf.Vec3f(*extents.tolist()),
         **({} if mass is None else {"mass": float(mass)}),
     }
-    stage.GetRootLayer().customLayerData = {"SimReady_Metadata": told}
+    stage.GetRootLayer().customLayerData = {"SimReady_Metadata": metadata}
     return stage

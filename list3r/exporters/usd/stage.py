@@ -31,9 +31,9 @@ class UsdSettings:
     """What goes into the stage."""
 
     points_per_instance: int = 5000
-    """At most so many points of a thing."""
+    """At most this many points of a thing."""
     points_per_structure: int = 20000
-    """At most so many points of a floor, a wall and the like."""
+    """At most this many points of a floor, a wall and the like."""
     mesh: bool = False
     """Whether instances and structure have a closed mesh too; their points are then invisible."""
     colliders: bool = False
@@ -199,7 +199,7 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
 
 
 def _group(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
-    """Return the path of a group, made at its first instance: a kind that is set again composes all below it anew."""
+    """Return the path of a group, made at its first instance: a kind that is set again composes all below it again."""
     if not stage.GetPrimAtPath(path):
         Usd.ModelAPI(UsdGeom.Xform.Define(stage, path).GetPrim()).SetKind("group")
     return path

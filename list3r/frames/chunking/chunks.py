@@ -27,7 +27,7 @@ class ChunkSettings:
             )
 
     def times(self, step: int) -> ChunkSettings:
-        """Chunks of so many times as many frames."""
+        """Chunks of this many times as many frames."""
         return ChunkSettings(self.length * step, self.overlap * step)
 
 

@@ -34,7 +34,7 @@ class ShotCutSettings:
     least_shot: int = 5
     """Frames between two cuts; what is shorter is a flash and stays in one of its neighbours' shots."""
     factor: float = 3.0
-    """A suspect is so many times less like the frame before than is usual around it."""
+    """A suspect is this many times less like the frame before than is usual around it."""
     thumbnail_likeness: float = 0.9
     """Correlation, best over small shifts, from which thumbnails are alike whatever is usual: of consecutive frames of
     hand-held video at 3 to 30 a second 99 in 100 are above, of frames of different places 1 in 100."""
@@ -43,9 +43,9 @@ class ShotCutSettings:
     ratio: float = 0.85
     """Lowe's ratio of best to second best distance."""
     least_features: int = 60
-    """A frame with fewer (a plain wall, darkness, blur) tells nothing."""
+    """A frame with fewer (a plain wall, darkness, blur) says nothing."""
     least_agreeing: int = 14
-    """Matches that agree on one epipolar geometry or homography: from so many on two frames see the same. Unrelated
+    """Matches that agree on one epipolar geometry or homography: from this many on two frames see the same. Unrelated
     frames give up to 12 by chance."""
     agreeing_share: float = 0.12
     """The same as a share of the matches that agree between neighbours on either side, if that is more."""
@@ -178,7 +178,7 @@ def _small(gray: Gray | None) -> Gray | None:
 def _thumbnail_likeness(a: Gray | None, b: Gray | None) -> float:
     """Correlation of the middle of each with the best place in the other: blind to exposure, patient with turning.
 
-    A picture without contrast is like anything: it tells nothing.
+    A picture without contrast is like anything: it says nothing.
     """
     assert a is not None and b is not None
     if a.shape != b.shape:

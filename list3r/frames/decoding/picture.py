@@ -82,7 +82,7 @@ class Upright:
         if self.aspect != 1:
             out.append(f"pixels are {float(self.aspect):.3g} times as wide as high and are made square")
         if self.interlaced:
-            out.append("frames are interlaced, which smears what moves; better deinterlace first (ffmpeg -vf bwdif)")
+            out.append("frames are interlaced, which smears what moves; deinterlace it first (ffmpeg -vf bwdif)")
         if self.hdr:
             out.append("the video is HDR10 (PQ); its brightness is brought to that of ordinary video")
         return tuple(out)

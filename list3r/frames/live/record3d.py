@@ -24,7 +24,7 @@ from list3r.memory.errors import OptionError, SourceError
 
 PORT = 1337
 _VARIES = 0.01
-"""Focal lengths that differ by a larger share are told of."""
+"""Focal lengths that differ by a larger share are reported."""
 _OUTER = struct.Struct(">4I")
 _HEADER = struct.Struct("<11I")
 _FLOATS = struct.Struct("<11f")
@@ -66,7 +66,7 @@ class Record3dPhone:
             raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
         self._serial, self._tell = serial, tell
         self._first: _PhoneFrame | None = None
-        self._told = set[str]()
+        self._noted = set[str]()
 
     def pictures(self, folder: Path, silence_s: float) -> Iterator[LivePicture]:
         """The frames of one connection; the camera is written to `folder` with the first of all.
@@ -80,19 +80,19 @@ class Record3dPhone:
                 frame = _parsed(_message(phone))
                 first = self._first = self._first or _begun(folder, frame)
                 if frame.sizes != first.sizes:
-                    self._say(f"pictures that are not {first.sizes.color[0]}x{first.sizes.color[1]} are left out")
+                    self._note_once(f"pictures that are not {first.sizes.color[0]}x{first.sizes.color[1]} are left out")
                     continue
                 if again:
-                    self._say("the phone's poses after a lost connection are of another world and are left out")
+                    self._note_once("the phone's poses after a lost connection are in another world and are left out")
                 if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > _VARIES:
-                    self._say("the focal length changes by more than 1 %: one camera serves all pictures")
+                    self._note_once("the focal length changes by more than 1 %: one camera serves all pictures")
                 pose = () if again else frame.pose
                 yield LivePicture(frame.files.copy, " ".join(f"{v:.9g}" for v in pose))
 
-    def _say(self, line: str) -> None:
+    def _note_once(self, line: str) -> None:
         """Tell something, once."""
-        if line not in self._told:
-            self._told.add(line)
+        if line not in self._noted:
+            self._noted.add(line)
             self._tell(line)
 
 
@@ -100,9 +100,9 @@ def _begun(folder: Path, frame: _PhoneFrame) -> _PhoneFrame:
     """Write down the camera of the first frame, as Record3D's own recordings state theirs."""
     (width, height), depth = frame.sizes.color, frame.sizes.depth
     fx, fy, cx, cy = frame.intrinsics
-    said = {"w": width, "h": height, "dw": depth[0], "dh": depth[1], "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
-    said["confidence"] = ".conf" in frame.files
-    (folder / METADATA).write_text(json.dumps(said), encoding="ascii")
+    metadata = {"w": width, "h": height, "dw": depth[0], "dh": depth[1], "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    metadata["confidence"] = ".conf" in frame.files
+    (folder / METADATA).write_text(json.dumps(metadata), encoding="ascii")
     return frame
 
 
@@ -112,7 +112,7 @@ def _message(phone: socket.socket) -> bytearray:
     while length == 0:
         length = _OUTER.unpack(receive(phone, _OUTER.size))[3]
     if length > _MOST_BYTES:
-        raise LostError(f"what came is not a frame of Record3D: {length} bytes")
+        raise LostError(f"the data received is not a frame of Record3D: {length} bytes")
     return receive(phone, length)
 
 
@@ -120,16 +120,16 @@ def _parsed(body: bytearray) -> _PhoneFrame:
     """Return what a message says. Raises `LostError` where it is no frame, `SourceError` for the front camera."""
     start = _HEADER.size + _FLOATS.size
     if len(body) < start:
-        raise LostError("what came is not a frame of Record3D 1.10 or newer")
+        raise LostError("the data received is not a frame of Record3D 1.10 or newer")
     *sizes, jpeg, depth, confidence, misc, kind = _HEADER.unpack_from(body)
     numbers = _FLOATS.unpack_from(body, _HEADER.size)
     pixels = [sizes[k] * sizes[k + 1] for k in (0, 2, 4)]
     fits = start + jpeg + depth + confidence + misc == len(body) and jpeg > 0
     fits = fits and pixels[0] > 0 and 0 < pixels[1] <= MOST_DEPTH_PIXELS and pixels[2] <= MOST_DEPTH_PIXELS
     if not (fits and np.isfinite(numbers[:4]).all() and min(numbers[:2]) > 0):
-        raise LostError("what came is not a frame of Record3D 1.10 or newer")
+        raise LostError("the data received is not a frame of Record3D 1.10 or newer")
     if kind == _FRONT_CAMERA:
-        raise SourceError("the phone streams its front camera, which knows no poses: choose LiDAR in Record3D")
+        raise SourceError("the phone streams its front camera, which has no poses: choose LiDAR in Record3D")
     files, at = {}, start
     for ending, size in ((".jpg", jpeg), (".depth", depth), (".conf", confidence)):
         files[ending] = bytes(body[at : at + size])

@@ -39,7 +39,7 @@ class StreamFeed:
     """A `Feed` of a live camera; a thread takes its pictures in."""
 
     def __init__(self, camera: LiveCamera, folder: Path, settings: LiveSettings, fps: float | None, tell: Tell) -> None:
-        """`fps` thins the pictures out to so many a second. `folder` is made, and must not exist."""
+        """`fps` thins the pictures out to this many a second. `folder` is made, and must not exist."""
         self.folder, self._camera, self._settings, self._tell = folder, camera, settings, tell
         self._least_gap_s = 0.0 if fps is None else 0.9 / fps
         self._lock = threading.Lock()
@@ -98,9 +98,9 @@ class StreamFeed:
     def _follow(self) -> str:
         """Take pictures in until the stream is over; why it was."""
         s = self._settings
-        last, pause_s, told = time.monotonic(), s.pause_s, ""
+        last, pause_s, shown = time.monotonic(), s.pause_s, ""
         while not self._stop.is_set():
-            came_s, whole, said = self._receive()
+            came_s, whole, reason = self._receive()
             if self._stop.is_set():
                 break
             if whole:
@@ -108,10 +108,10 @@ class StreamFeed:
             if came_s is not None:
                 last, pause_s = came_s, s.pause_s
             if time.monotonic() - last > s.retry_s:
-                return f"the connection was lost ({said}) and did not come back within {s.retry_s:g} s"
-            if came_s is not None or said != told:
-                told = said
-                self._tell(f"no connection to {self._camera.name} ({said}); it is tried again")
+                return f"the connection was lost ({reason}) and did not come back within {s.retry_s:g} s"
+            if came_s is not None or reason != shown:
+                shown = reason
+                self._tell(f"no connection to {self._camera.name} ({reason}); it is tried again")
             with self._lock:
                 self._gap = True
                 self._state = replace(self._state, reconnects=self._state.reconnects + (came_s is not None))

@@ -56,7 +56,7 @@ def connect(serial: str, port: int, timeout_s: float) -> socket.socket:
 
 
 def receive(connection: socket.socket, count: int) -> bytearray:
-    """Return so many bytes. Raises `LostError`."""
+    """Return this many bytes. Raises `LostError`."""
     data = bytearray(count)
     view, held = memoryview(data), 0
     try:
@@ -66,7 +66,7 @@ def receive(connection: socket.socket, count: int) -> bytearray:
                 raise LostError("it was closed")
             held += more
     except TimeoutError:
-        raise LostError("nothing came") from None
+        raise LostError("no data came") from None
     except OSError as error:
         raise LostError(error.strerror or str(error)) from None
     return data
@@ -84,8 +84,8 @@ def _daemon(timeout_s: float) -> socket.socket:
         host, _, port = address.rpartition(":")
         return socket.create_connection((host, int(port)), timeout_s)
     except (OSError, ValueError, OverflowError) as error:
-        said = getattr(error, "strerror", None) or error
-        raise LostError(f"usbmuxd does not answer at {address} ({said}): is it installed and running?") from None
+        reason = getattr(error, "strerror", None) or error
+        raise LostError(f"usbmuxd does not answer at {address} ({reason}): is it installed and running?") from None
 
 
 def _ask(daemon: socket.socket, kind: str, **words: object) -> dict[str, Any]:

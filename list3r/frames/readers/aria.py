@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
@@ -28,7 +28,7 @@ from list3r.frames.recordings.aria_trajectory import DeviceTrajectory, read_traj
 from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.registration.rig import WORKING_SIDES
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
 
 COLOR, DEPTH = "214-1", "345-1"
 """Streams of the colour camera and, in a file of its own, of the Digital Twin's depth on its pixels."""
@@ -52,7 +52,7 @@ def _video(root: Path) -> Path | None:
     return (usual or found)[0] if usual or len(found) == 1 else None
 
 
-class AriaSource:
+class AriaSource(Reader):
     """A `FrameSource` over one recording; nothing but its clock and its poses is kept."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:
@@ -83,17 +83,8 @@ class AriaSource:
         limit = WORKING_SIDES[self._depth_path is not None] if options.max_side is None else options.max_side
         self._view = UprightView(lens, (int(size[0]), int(size[1])), turns, limit)
         self._poses = [None if T is None else T @ self._view.T_cam_upright for T in placed] or [None] * len(pairs)
-        notes += [] if table is None or moved is None else _said(table, moved, self._poses)
+        notes += [] if table is None or moved is None else _pose_notes(table, moved, self._poses)
         self._info = self._describe(root, tuple(notes), moved)
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
@@ -147,18 +138,18 @@ class AriaSource:
 
 
 def _check(root: Path, options: SourceOptions) -> None:
-    said = {
+    reasons = {
         "--intrinsics": options.intrinsics,
         "--distortion": options.distortion,
         "--depth-intrinsics": options.depth_intrinsics,
         "--depth-to-color": options.T_color_depth,
     }
-    given = [name for name, value in said.items() if value is not None]
+    given = [name for name, value in reasons.items() if value is not None]
     if given:
         raise OptionError(f"{root} states its own cameras; leave out {' and '.join(given)}")
 
 
-def _said(table: Path, moved: DeviceTrajectory, poses: Sequence[NDArray[np.float64] | None]) -> list[str]:
+def _pose_notes(table: Path, moved: DeviceTrajectory, poses: Sequence[NDArray[np.float64] | None]) -> list[str]:
     out = [f"poses of {table.name} for {sum(T is not None for T in poses)} of {len(poses)} pictures"]
     if moved.elsewhere:
         out.append(f"{moved.elsewhere} pictures have poses in another world (graph_uid), which are left out")
@@ -175,16 +166,16 @@ def _opened(path: Path, stream: str) -> Any:
             from projectaria_tools.core.stream_id import StreamId
     except ImportError:
         raise OptionError(
-            f"{path} is a recording of Aria, which takes: pip install 'list3r[aria]' (or, without what its tools draw "
-            "with: pip install --no-deps projectaria-tools)"
+            f"{path} is a recording of Aria, which needs a package: pip install 'list3r[aria]' (or, without its "
+            "drawing tools: pip install --no-deps projectaria-tools)"
         ) from None
     try:
         with _quiet():
             provider = create_vrs_data_provider(str(path))
     except RuntimeError as error:
-        raise SourceError(f"{path} cannot be read ({str(error).splitlines()[0]}); copy it again") from None
+        raise SourceError(f"{path} cannot be read ({first_line(error)}); copy it again") from None
     if provider is None:
-        raise SourceError(f"{path} is not a recording in VRS that can be read; was the copy finished?")
+        raise SourceError(f"{path} is not a recording in VRS that can be read; is the copy complete?")
     streams = [str(s) for s in provider.get_all_streams()]
     if stream not in streams or not provider.get_num_data(StreamId(stream)):
         raise SourceError(f"{path} has no pictures in the stream {stream}, but {', '.join(streams) or 'none'}")
@@ -206,7 +197,7 @@ def _picture(provider: Any, stream: str, number: int) -> NDArray[Any]:
         with _quiet():
             image = provider.get_image_data_by_index(StreamId(stream), number)[0]
     except RuntimeError as error:
-        raise FrameError(f"picture {number} of {stream} cannot be decoded ({str(error).splitlines()[0]})") from None
+        raise FrameError(f"picture {number} of {stream} cannot be decoded ({first_line(error)})") from None
     if not image.is_valid():
         raise FrameError(f"picture {number} of {stream} cannot be decoded")
     return np.asarray(image.to_numpy_array())

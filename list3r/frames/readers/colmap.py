@@ -25,7 +25,7 @@ from list3r.frames.layout import (
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.colmap_files import frames_are_whole, written_sizes
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, first_line
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 _FOLDERS = ("images", "rgb", "color", ".")
@@ -62,7 +62,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if others:
         notes.append(f"the model poses {len(posed)} pictures; not read: the models {', '.join(others)} beside it")
     if len(cameras) > 1:
-        notes.append(f"the model has {len(cameras)} cameras; every picture is carried to their median")
+        notes.append(f"the model has {len(cameras)} cameras; all pictures are resampled to their median")
     size = (shared.height, shared.width)
     optics = Optics(intrinsics, shared.distortion, intrinsics_size=size, fisheye=shared.fisheye)
     if options.intrinsics is not None:
@@ -94,10 +94,10 @@ def _read(model: Path) -> tuple[Any, dict[str, NDArray[np.float64]]]:
     except IndexError:
         raise SourceError(apart) from None
     except (RuntimeError, ValueError, OSError) as error:
-        said = str(error).splitlines()[0]
-        if "optional" in said:
-            said = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
-        raise SourceError(f"{model} is not a model of COLMAP that can be read ({said})") from None
+        reason = first_line(error)
+        if "optional" in reason:
+            reason = "a rig does not say where it holds one of its cameras; colmap rig_configurator calibrates it"
+        raise SourceError(f"{model} is not a model of COLMAP that can be read ({reason})") from None
     poses = {name: pose_matrix(rows.ravel().tolist()) for name, rows in stated.items()}
     wrong = [name for name, T in poses.items() if T is None]
     if wrong:

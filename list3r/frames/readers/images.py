@@ -62,5 +62,5 @@ def _poses(root: Path, count: int) -> tuple[list[NDArray[np.float64] | None], tu
         return [None] * count, ()
     rows = read_numbers(path)
     if len(rows) != count:
-        return [None] * count, (f"{path.name} has {len(rows)} rows for {count} images and is left aside",)
+        return [None] * count, (f"{path.name} has {len(rows)} rows for {count} images and is ignored",)
     return [pose_matrix(row) for row in rows], (f"poses of {path.name}",)

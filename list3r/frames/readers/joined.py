@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Frame, Reader
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.memory.errors import OptionError, SourceError
 
 
-class JoinedVideos:
+class JoinedVideos(Reader):
     """A `FrameSource` over files in the order given; frames are numbered and timed as if they were one file."""
 
     def __init__(self, paths: Sequence[Path], options: SourceOptions) -> None:
@@ -41,15 +41,6 @@ class JoinedVideos:
             fingerprint=hashlib.sha256(prints.encode()).hexdigest()[:32],
             notes=(*first.notes, f"{len(paths)} files, one after the other"),
         )
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""

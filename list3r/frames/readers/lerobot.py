@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -36,7 +36,7 @@ def is_dataset(root: Path) -> bool:
     return (root / INFO).is_file() and ((root / "data").is_dir() or (root / "videos").is_dir())
 
 
-class LeRobotSource:
+class LeRobotSource(Reader):
     """A `FrameSource`: the pictures of one camera in one episode, numbered from 0, with depth where a key has it."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:
@@ -57,25 +57,16 @@ class LeRobotSource:
             code = DepthCode.of(filmed[depth].get("info"))
             self._depth = _DepthVideo(file, round(begins_s * fps), episode.length, code)
         stored = self._video.stored_size
-        optics, said = merge_optics(FolderLayout("lerobot", FrameFiles(), Optics(depth_scale=1.0)), options)
+        optics, merged_notes = merge_optics(FolderLayout("lerobot", FrameFiles(), Optics(depth_scale=1.0)), options)
         size = None if self._depth is None else self._depth.size
         self._rig = build_rig(optics, stored, size, options.max_depth_m, _side(options, depth is not None))
         used = {color} if depth is None else {color, depth}
-        notes = [f"episode {episode.number}, {episode.length} frames, of the camera {color}", *said]
+        notes = [f"episode {episode.number}, {episode.length} frames, of the camera {color}", *merged_notes]
         if depth is not None and self._rig.registration is None:
-            notes.append(f"depth of {depth} is taken to lie on the colour pixels; --depth-to-color says otherwise")
+            notes.append(f"depth of {depth} is assumed to lie on the colour pixels; --depth-to-color changes that")
         if unused := [k for k in features if k not in used and k not in _BOOKKEEPING]:
             notes.append(f"not used: {', '.join(unused)}")
         self._info = self._describe(root, options, episode, tuple(notes))
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""
@@ -153,8 +144,8 @@ def _choose(root: Path, role: str, keys: Mapping[str, Any], options: SourceOptio
     if wanted is None and len(keys) == 1:
         return next(iter(keys))
     if wanted is None or wanted not in keys:
-        said = "has several cameras" if wanted is None else f"has no camera {wanted}"
-        raise OptionError(f"{root} {said} ({names}); choose by --topics {role}=KEY")
+        problem = "has several cameras" if wanted is None else f"has no camera {wanted}"
+        raise OptionError(f"{root} {problem} ({names}); choose by --topics {role}=KEY")
     return wanted
 
 

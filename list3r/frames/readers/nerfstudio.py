@@ -54,7 +54,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(_file(root, path, row, turned) for row in rows)
     if rows and not len(files.that_hold(POSE)) and any("transform_matrix" in row for row in rows):
         raise SourceError(
-            f"{path}: the transform_matrix of no frame is a rigid motion (4x4, row by row); mend it, or say --kind "
+            f"{path}: the transform_matrix of no frame is a rigid motion (4x4, row by row); fix it, or say --kind "
             "images to take colour alone"
         )
     fisheye = model == _FISHEYE and options.distortion is None
@@ -86,7 +86,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
 
 def _row(path: Path, number: int, frame: object) -> Mapping[str, Any]:
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-        raise SourceError(f"{path}: frame {number} names no file_path; mend or remove it")
+        raise SourceError(f"{path}: frame {number} names no file_path; fix or remove it")
     return frame
 
 
@@ -102,7 +102,7 @@ def _metric(content: Mapping[str, Any], files: Sequence[FrameFile]) -> bool:
 def _units_per_metre(path: Path, content: Mapping[str, Any]) -> float:
     unit_m = content.get("depth_unit_scale_factor", 0.001)
     if not isinstance(unit_m, int | float) or not unit_m > 0:
-        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is not a positive number of metres; mend it")
+        raise SourceError(f"{path}: depth_unit_scale_factor {unit_m!r} is not a positive number of metres; fix it")
     return 1.0 / unit_m
 
 

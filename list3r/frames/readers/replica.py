@@ -54,7 +54,7 @@ def _poses(path: Path, colors: list[str]) -> tuple[list[NDArray[np.float64] | No
         return rows, ()
     numbers = [int(digits) for digits in (_number(name) for name in colors) if digits.isdigit()]
     if len(numbers) < len(colors):
-        raise SourceError(f"{path} has {len(rows)} poses for {len(colors)} images without numbers; mend or remove it")
+        raise SourceError(f"{path} has {len(rows)} poses for {len(colors)} images without numbers; fix or remove it")
     poses = [rows[n] if n < len(rows) else None for n in numbers]
     known = sum(n < len(rows) for n in numbers)
     note = f"{path.name} has {len(rows)} poses for {len(colors)} frames; {known} frames have the pose of their number"
@@ -76,7 +76,7 @@ def _camera(base: Path, options: SourceOptions) -> tuple[Intrinsics, float, tupl
             values = [float(camera[name]) for name in ("fx", "fy", "cx", "cy")]
             return check_intrinsics(values), float(camera.get("scale", _SCALE)), (f"camera of {path.name}",)
         except (KeyError, TypeError, ValueError, AttributeError, OptionError):
-            raise SourceError(f"{path} has no camera with fx, fy, cx, cy; mend or remove it") from None
+            raise SourceError(f"{path} has no camera with fx, fy, cx, cy; fix or remove it") from None
     if options.intrinsics is not None:
         return options.intrinsics, _SCALE, ()
     return _NICE_SLAM, _SCALE, ("no cam_params.json: the camera of NICE-SLAM's renders (1200x680) is assumed",)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Listing, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Listing, Reader, SourceInfo, missing_parts
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
 from list3r.frames.layout import FolderLayout, Optics
@@ -24,12 +24,12 @@ from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.bag_chunks import bound_rosbags
-from list3r.frames.recordings.bag_mending import MendedFile, mended
+from list3r.frames.recordings.bag_recovery import RecoveredFile, recovered
 from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
 from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -39,7 +39,7 @@ _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TF = "tf2_msgs/msg/TFMessage"
 _INFO = "sensor_msgs/msg/CameraInfo"
-_TOLD_EVERY = 200
+_REPORTED_EVERY = 200
 """Messages after which whoever watches hears of the listing."""
 _PACKED = ".zstd"
 """Ends the names of files that `ros2 bag record --compression-mode file` packed, also in metadata, which stay so."""
@@ -55,7 +55,7 @@ def is_recording(path: Path) -> bool:
     """
     packed = [path] if path.is_file() else [p for end in ENDINGS for p in path.glob(f"*{end}{_PACKED}")]
     if any(p.name.endswith(tuple(end + _PACKED for end in ENDINGS)) for p in packed):
-        raise SourceError(f"{path} is packed as a whole: unpack it (`zstd -d --rm {packed[0]}`), and give it again")
+        raise SourceError(f"{path} is compressed as a whole: unpack it (`zstd -d --rm {packed[0]}`), and give it again")
     if path.is_dir():
         return bool(_files(path))
     return path.suffix.lower() in ENDINGS or path.name.endswith(".bag.active")
@@ -88,7 +88,7 @@ class Stream:
     """The first message."""
 
 
-class BagSource:
+class BagSource(Reader):
     """A `FrameSource` over one recording; nothing but its index is kept."""
 
     def __init__(self, path: Path, options: SourceOptions, listing: Listing | None = None) -> None:
@@ -116,12 +116,12 @@ class BagSource:
         world = tree.world_of(color.frame)
         self._poses = tree.poses(color.frame, world, self._times_s) if world else [None] * len(pairs)
         self._chosen = select(self._times_s, options, path, clock=True, video=False)
-        merged, said = merge_optics(FolderLayout("rosbag", FrameFiles(), optics), options)
+        merged, merged_notes = merge_optics(FolderLayout("rosbag", FrameFiles(), optics), options)
         size = None if depth is None else read_depth(depth.first).shape
         stored = read_color(color.first).shape[:2]
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
         posed = sum(T is not None for T in self._poses)
-        notes = [*notes, *said, *_cut_off(path), *unread]
+        notes = [*notes, *merged_notes, *_cut_off(path), *unread]
         if len(pairs) < len(color.times_s):
             left = len(color.times_s) - len(pairs)
             notes.append(f"{left} of {len(color.times_s)} pictures have no depth within 20 ms and are left out")
@@ -132,15 +132,6 @@ class BagSource:
         elif tree.moving:
             notes.append(f"poses of {', '.join(sorted(tree.moving))}; no transform leads from there to {color.frame}")
         self._info = replace(self._describe(tuple(notes), posed > 0), poses_drift=world == DRIFTING)
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""
@@ -238,7 +229,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise OptionError(f"{path} is a ROS recording, which takes: pip install 'list3r[ros]'") from None
+        raise OptionError(f"{path} is a ROS recording, which needs a package: pip install 'list3r[ros]'") from None
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):
@@ -247,15 +238,16 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         with AnyReader(_parts(path), default_typestore=known) as reader:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SourceError(f"{path} cannot be read as a ROS recording ({said}); reindex it, or copy it again") from None
+        raise SourceError(
+            f"{path} cannot be read as a ROS recording ({first_line(error)}); reindex it, or copy it again"
+        ) from None
 
 
 def _parts(path: Path) -> list[Any]:
     """What `rosbags` opens of a recording: files that lack their end, with one."""
     decompressors = bound_rosbags()
     files = _files(path) if path.is_dir() else [path]
-    parts = [mended(p, decompressors) or p for p in files]
+    parts = [recovered(p, decompressors) or p for p in files]
     return [path] if parts == files and _describes(path / "metadata.yaml") else parts
 
 
@@ -267,9 +259,9 @@ def _describes(metadata: Path) -> bool:
 def _cut_off(path: Path) -> list[str]:
     """Say what is read of the files that lack their end."""
     return [
-        f"{p.path.name} has no index, its recorder did not end it: {100 * p.end // p.size} % of it are whole and read"
+        f"{p.path.name} has no index, because its recorder was interrupted; {100 * p.end // p.size} % of it is read"
         for p in _parts(path)
-        if isinstance(p, MendedFile)
+        if isinstance(p, RecoveredFile)
     ]
 
 
@@ -314,7 +306,7 @@ class _Topics:
         depth_intrinsics, _, depth_size = self._camera(depth)
         T_color_depth = tree.between(color.frame, depth.frame)
         if T_color_depth is not None:
-            notes.append("the place of the depth camera is that of /tf_static")
+            notes.append("the pose of the depth camera is from /tf_static")
         return Optics(intrinsics, lens, depth_intrinsics, T_color_depth, units, size, depth_size), notes
 
     def _camera(self, stream: Stream) -> tuple[Any, tuple[float, ...], tuple[int, int] | None]:
@@ -346,13 +338,13 @@ class _Topics:
 
     def unread(self, pictures: set[str]) -> tuple[str, ...]:
         """Return a note on the topics that nothing is taken from, where `pictures` are those of colour and depth."""
-        left = [t for t in self._of if t not in pictures and not self._told(t)]
+        left = [t for t in self._of if t not in pictures and not self._taken_in(t)]
         return (f"not read: {self._named(left)}",) if left else ()
 
-    def _told(self, topic: str) -> bool:
-        """Whether what a topic says of cameras and poses was taken in."""
+    def _taken_in(self, topic: str) -> bool:
+        """Whether the cameras or poses of a topic were used."""
         kind = self._of[topic].msgtype
-        return kind not in _IMAGES and self._tells(topic, kind, self._pose_topic)
+        return kind not in _IMAGES and self._is_read(topic, kind, self._pose_topic)
 
     def _all_topics(self) -> str:
         return f"it has {self._named(list(self._of))}" if self._of else "it is empty"
@@ -370,11 +362,11 @@ class _Topics:
         units: dict[str, float] = {}
         tree = TransformTree()
         pose_topic = self._pose_topic
-        looked_at = [c for c in self._reader.connections if self._tells(c.topic, c.msgtype, pose_topic)]
+        looked_at = [c for c in self._reader.connections if self._is_read(c.topic, c.msgtype, pose_topic)]
         count = sum(c.msgcount for c in looked_at)
         for number, (connection, received, raw) in enumerate(self._reader.messages(looked_at), start=1):
             topic, kind = connection.topic, connection.msgtype
-            if self._listing is not None and (number % _TOLD_EVERY == 0 or number == count):
+            if self._listing is not None and (number % _REPORTED_EVERY == 0 or number == count):
                 self._listing(number, count)
             if kind in _IMAGES:
                 if topic not in first:
@@ -403,8 +395,8 @@ class _Topics:
         return streams, tree, infos, by_topic
 
     @staticmethod
-    def _tells(topic: str, kind: str, pose_topic: str | None) -> bool:
-        """Whether messages say something of pictures, cameras or poses; clouds and the like are not read."""
+    def _is_read(topic: str, kind: str, pose_topic: str | None) -> bool:
+        """Whether messages hold pictures, cameras or poses; clouds and the like are not read."""
         return kind in (*_IMAGES, _INFO, _TF) or topic == pose_topic or topic.endswith("/option/Depth_Units/value")
 
     def _only_pose_topic(self) -> str | None:

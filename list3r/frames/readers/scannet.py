@@ -113,7 +113,7 @@ def _intrinsics(matrix: NDArray[np.float64]) -> Intrinsics:
 def _matrix_file(path: Path) -> Intrinsics:
     rows = read_numbers(path) if path.is_file() else []
     if len(rows) < 2 or min(len(rows[0]), len(rows[1])) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
-        raise SourceError(f"{path} is not a camera matrix; mend it, or give --intrinsics and --depth-intrinsics")
+        raise SourceError(f"{path} is not a camera matrix; fix it, or give --intrinsics and --depth-intrinsics")
     return rows[0][0], rows[1][1], rows[0][2], rows[1][2]
 
 

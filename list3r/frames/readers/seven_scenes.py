@@ -74,6 +74,6 @@ def _file_intrinsics(folder: Path, root: Path) -> tuple[Intrinsics, str]:
         if path.is_file():
             rows = read_numbers(path)
             if len(rows) < 2 or len(rows[0]) < 3 or len(rows[1]) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
-                raise SourceError(f"{path} is not a 3x3 camera matrix; mend or remove it")
+                raise SourceError(f"{path} is not a 3x3 camera matrix; fix or remove it")
             return (rows[0][0], rows[1][1], rows[0][2], rows[1][2]), f"intrinsics of {path.name}"
     return KINECT_NOMINAL, "no camera-intrinsics.txt: the Kinect of 7-Scenes is assumed"

@@ -42,7 +42,7 @@ def _files(root: Path, path: Path, camera: PhoneCamera | None = None, sure: bool
         try:
             color, time_s, pose = inside(root, words[1], path), float(words[0]), [float(v) for v in words[2:]]
         except (IndexError, ValueError):
-            raise SourceError(f"{path}: line {number} is not seconds, a name and a pose; mend or remove it") from None
+            raise SourceError(f"{path}: line {number} is not seconds, a name and a pose; fix or remove it") from None
         if camera is None:
             yield FrameFile(color, time_s=time_s)
             continue

@@ -57,7 +57,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         depths = _read_list(root / "depth.txt")
         pairs = associate(colors.times_s, depths.times_s, MAX_PAIR_GAP_S)
         if not len(pairs):
-            raise SourceError(f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; mend depth.txt")
+            raise SourceError(f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; fix depth.txt")
         if len(pairs) < len(colors):
             alone = len(colors) - len(pairs)
             notes.append(f"{alone} of {len(colors)} colour images have no depth image in time and are left out")
@@ -151,7 +151,7 @@ def _read_list(path: Path) -> _TimedNames:
             times_s.append(float(words[0]))
             names += words[1].strip().encode("utf-8")
         except (ValueError, IndexError):
-            raise SourceError(f"{path}: line {number} is not 'timestamp filename'; mend or remove it") from None
+            raise SourceError(f"{path}: line {number} is not 'timestamp filename'; fix or remove it") from None
         ends.append(len(names))
     if not times_s:
         raise SourceError(f"{path} names no image; is the copy complete?")

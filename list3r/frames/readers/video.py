@@ -11,10 +11,10 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
-from list3r.frames.decoding.stamps import list_stamps, open_container, packets, picture_stream
+from list3r.frames.decoding.timestamps import list_timestamps, open_container, packets, picture_stream
 from list3r.frames.folder import centred_camera, fingerprint, reduced_note
 from list3r.frames.layout import Optics
 from list3r.frames.options import SourceOptions
@@ -27,33 +27,24 @@ _EARLIER = 4
 """Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
 
-class VideoSource:
-    """A `FrameSource` over one video stream. Every `read` opens the file anew and seeks to its first frame."""
+class VideoSource(Reader):
+    """A `FrameSource` over one video stream. Every `read` opens the file again and seeks to its first frame."""
 
-    def __init__(self, path: Path, options: SourceOptions, *, said: bool = True) -> None:
+    def __init__(self, path: Path, options: SourceOptions, *, by_user: bool = True) -> None:
         """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`.
 
-        `said`: the intrinsics of the options are the user's word, not that of a file beside the video.
+        `by_user`: the intrinsics of the options are the user's word, not that of a file beside the video.
         """
         if options.depth_intrinsics or options.T_color_depth:
             raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
-        self._path, self._options, self._said = path, options, said
-        self._stamps = list_stamps(path)
+        self._path, self._options, self._by_user = path, options, by_user
+        self._stamps = list_timestamps(path)
         self._fps = self._stamps.rate if self._stamps.clock else options.fps or self._stamps.rate
         count = len(self._stamps)
         times_s = self._stamps.times_s(0, count) if self._stamps.clock else np.arange(count) / self._fps
         self._chosen = select(times_s, options, path, clock=self._stamps.clock, video=True)
         self._upright, self._rig = self._first()
         self._info = self._describe()
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
@@ -162,7 +153,7 @@ class VideoSource:
         return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
 
     def _first(self) -> tuple[Upright, Rig]:
-        optics = Optics(self._options.intrinsics, self._options.distortion or (), said=self._said)
+        optics = Optics(self._options.intrinsics, self._options.distortion or (), by_user=self._by_user)
         for _, image in self._decode(int(self._chosen.starts[0])):
             turned = Upright.of(image, self._stamps.aspect)
             return turned, build_rig(optics, turned.size, None, None, self._options.max_side)
@@ -175,7 +166,7 @@ class VideoSource:
         if not self._stamps.clock:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
         if self._chosen.sharpest:
-            notes.append("of each so many frames the sharpest is taken; --no-sharpest takes the first")
+            notes.append("of each group of frames the sharpest is taken; --no-sharpest takes the first")
         missing = missing_parts(depth=False, camera=rig.camera is not None)
         focal = None if rig.camera is not None else self._stamps.focal_35mm
         height, width = rig.stored_size

@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
 from list3r.frames.layout import Optics
-from list3r.frames.leftovers import not_read
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
+from list3r.frames.unread import not_read
 from list3r.memory.errors import FrameError
 
 _FRAMES_TRIED = 12
@@ -48,31 +48,24 @@ class RecordingParts:
     """Frames' own cameras, of the pictures as stored, where they differ from `intrinsics`."""
 
 
-class VideoWithDepth:
+class VideoWithDepth(Reader):
     """A `FrameSource`: the pictures of the video, each with depth and pose of its number."""
 
     def __init__(self, root: Path, parts: RecordingParts, options: SourceOptions) -> None:
         """Raises `SourceError` and `OptionError` where the files do not fit together."""
         side = WORKING_SIDES[True] if options.max_side is None else options.max_side
         words = replace(options, kind="auto", intrinsics=parts.intrinsics, max_side=side, depth_scale=None)
-        said = options.intrinsics is not None
-        self._video, self._parts = VideoSource(parts.video, words, said=said), parts
+        given = options.intrinsics is not None
+        self._video, self._parts = VideoSource(parts.video, words, by_user=given), parts
         stored = self._video.stored_size
         scale = options.depth_scale or parts.units_per_m
         lens = options.distortion or ()
-        optics = Optics(parts.intrinsics, lens, depth_scale=scale, intrinsics_size=stored, shares_view=True, said=said)
+        optics = Optics(
+            parts.intrinsics, lens, depth_scale=scale, intrinsics_size=stored, shares_view=True, by_user=given
+        )
         size = read_raw_depth(next(iter(parts.depth.values()))).shape if parts.depth else None
         self._rig = build_rig(optics, stored, (size[0], size[1]) if size else None, options.max_depth_m, side)
         self._info = self._describe(root)
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
-        return self._info
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        return self.read_every(start, stop, 1)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""

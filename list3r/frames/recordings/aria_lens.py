@@ -14,7 +14,7 @@ from list3r.frames.recordings.axes import CLOCKWISE
 from list3r.frames.selection import working_size
 
 _GRID = 8
-"""The lens is computed at every so many-th pixel; between these it is straight to a few thousandths of one."""
+"""Spacing of the pixels at which the lens is computed; between these it is straight to a few thousandths of one."""
 
 
 @dataclass(frozen=True)
@@ -72,5 +72,5 @@ class UprightView:
 
 
 def _grid(count: int) -> NDArray[np.float64]:
-    """Every so many-th pixel, and one beyond the last."""
+    """Pixels at that spacing, and one beyond the last."""
     return np.arange(0, count + _GRID, _GRID, dtype=np.float64)

@@ -78,7 +78,7 @@ def _rows(file: Iterator[str], columns: list[int], graph: int | None, path: Path
         try:
             values = [float(words[k]) for k in columns]
         except (ValueError, IndexError):
-            raise SourceError(f"{path}: line {number} is not a row of a trajectory; was the copy finished?") from None
+            raise SourceError(f"{path}: line {number} is not a row of a trajectory; is the copy complete?") from None
         values[0] *= 1e-6
         if pose_of_quaternion(values[1:4], values[4:8]) is None or not np.isfinite(values).all():
             continue

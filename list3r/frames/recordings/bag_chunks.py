@@ -20,7 +20,7 @@ class _Unpacker(Protocol):
     eof: bool
 
     def decompress(self, data: bytes, max_length: int = -1) -> bytes:
-        """Return at most so many bytes."""
+        """Return at most this many bytes."""
 
 
 def bounded(unpacker: Callable[[], _Unpacker]) -> Callable[..., bytes]:
@@ -65,7 +65,7 @@ def bound_rosbags() -> Mapping[str, Callable[..., bytes]]:
 
 
 def _read_exact(file: BinaryIO, size: int) -> bytes:
-    """Return so many bytes. Raises `ValueError` for more than any record has, before it asks for them."""
+    """Return this many bytes. Raises `ValueError` for more than any record has, before it asks for them."""
     data = file.read(size) if size <= MOST_BYTES else b""
     if len(data) != size:
         raise ValueError(f"a record states {size} bytes, and {len(data)} are there")

@@ -30,19 +30,19 @@ class DepthCode:
     logarithmic: bool
 
     @classmethod
-    def of(cls, said: object) -> DepthCode | None:
+    def of(cls, info: object) -> DepthCode | None:
         """Return what a feature of LeRobot says; None where it says nothing: then depth is in millimetres.
 
         Raises `SourceError` for numbers that mean no depth.
         """
-        said = said if isinstance(said, dict) else {}
-        if "video.depth_min" not in said or "video.depth_max" not in said:
+        info = info if isinstance(info, dict) else {}
+        if "video.depth_min" not in info or "video.depth_max" not in info:
             return None
-        least, most, shift = said["video.depth_min"], said["video.depth_max"], said.get("video.shift", 0.0)
-        logarithmic = bool(said.get("video.use_log", True))
+        least, most, shift = info["video.depth_min"], info["video.depth_max"], info.get("video.shift", 0.0)
+        logarithmic = bool(info.get("video.use_log", True))
         numbers = all(isinstance(v, int | float) and math.isfinite(v) for v in (least, most, shift))
         if not numbers or not 0 <= least < most or (logarithmic and least + shift <= 0):
-            raise SourceError(f"depth is coded from {least} to {most} m, shifted by {shift}; mend meta/info.json")
+            raise SourceError(f"depth is coded from {least} to {most} m, shifted by {shift}; fix meta/info.json")
         return cls(float(least), float(most), float(shift), logarithmic)
 
     def metres(self, codes: NDArray[Any]) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from list3r.frames.files import MAX_TEXT_BYTES, check_ordinary
 from list3r.frames.layout import inside, read_json
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, first_line
 
 INFO = "meta/info.json"
 _VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -31,18 +31,18 @@ class Episode:
 
 def read_features(path: Path) -> tuple[dict[str, dict[str, Any]], float]:
     """Return the features and the frames per second. Raises `SourceError`, also for a data set of another version."""
-    said = read_json(path)
-    version = said.get("codebase_version") if isinstance(said, dict) else None
-    if not isinstance(said, dict) or not isinstance(version, str):
+    info = read_json(path)
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not isinstance(info, dict) or not isinstance(version, str):
         raise SourceError(f"{path} states no codebase_version; is it of LeRobot?")
     if not version.startswith("v3."):
         raise SourceError(
             f"{path} is of LeRobot {version}, which keeps a video for each episode; give that video, or convert the "
             "data set to v3.0 by lerobot's own script"
         )
-    fps, features, video_path = said.get("fps"), said.get("features"), said.get("video_path", _VIDEO_PATH)
+    fps, features, video_path = info.get("fps"), info.get("features"), info.get("video_path", _VIDEO_PATH)
     if not isinstance(fps, int | float) or not 0 < fps < 10_000 or not isinstance(features, dict):
-        raise SourceError(f"{path} states no fps or no features; was it copied whole?")
+        raise SourceError(f"{path} states no fps or no features; is the copy complete?")
     if video_path != _VIDEO_PATH:
         raise SourceError(f"{path} has its videos at {video_path!r}, not at {_VIDEO_PATH}; convert it to LeRobot v3.0")
     found = {str(k): f for k, f in features.items() if isinstance(f, dict)}
@@ -73,7 +73,7 @@ def read_episode(root: Path, keys: list[str], number: int | None) -> Episode:
         name = f"videos/{key}/chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
         videos[key] = (inside(root, name, root / INFO), float(begins_s))
         if not videos[key][0].is_file():
-            raise SourceError(f"{root / name} is missing, in which episode {chosen} lies; was the copy finished?")
+            raise SourceError(f"{root / name} is missing, in which episode {chosen} lies; is the copy complete?")
     return Episode(chosen, int(row["length"]), videos)
 
 
@@ -83,7 +83,9 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise OptionError(f"{root} is a data set of LeRobot, which takes: pip install 'list3r[parquet]'") from None
+        raise OptionError(
+            f"{root} is a LeRobot data set, which needs a package: pip install 'list3r[parquet]'"
+        ) from None
     found: dict[int, dict[str, float]] = {}
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         try:
@@ -92,17 +94,16 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
                 _check_count(path, file.metadata.num_rows + len(found))
                 rows = file.read(columns=columns, use_threads=False).to_pylist()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            said = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise SourceError(f"{path} is not a table that can be read ({said[:160]}); copy it again") from None
+            raise SourceError(f"{path} is not a table that can be read ({first_line(error)}); copy it again") from None
         found |= {int(row["episode_index"]): row for row in (_sound(path, row, columns) for row in rows)}
     if not found:
-        raise SourceError(f"{root} has no episodes in meta/episodes; was the copy finished?")
+        raise SourceError(f"{root} has no episodes in meta/episodes; is the copy complete?")
     return found
 
 
 def _check_count(path: Path, count: int) -> None:
     if count > _MOST_EPISODES:
-        raise SourceError(f"{path} has over {_MOST_EPISODES:,} episodes; is it what it says?")
+        raise SourceError(f"{path} has over {_MOST_EPISODES:,} episodes; is it damaged?")
 
 
 def _sound(path: Path, row: dict[str, float], columns: list[str]) -> dict[str, float]:

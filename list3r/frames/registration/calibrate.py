@@ -39,9 +39,9 @@ class DepthCalibrationSettings:
     levels_px: tuple[float, ...] = (6.0, 3.0, 1.5, 1.0)
     """Blur of the colour edges from coarse to fine, px of a 640 px wide image."""
     center: bool = False
-    """Estimate cx, cy too; on one depth they cannot be told from the offset."""
+    """Estimate cx, cy too; on one depth they cannot be distinguished from the offset."""
     rotation: bool = False
-    """Estimate the rotation too; small ones cannot be told from cx, cy."""
+    """Estimate the rotation too; small ones cannot be distinguished from cx, cy."""
     groups: int = 4
     """Groups of frames left out in turn to find the uncertainty."""
     registered_px: float = 3.5

@@ -37,7 +37,7 @@ class EdgeFit:
         self._camera, self.aspect = camera, camera.fy / camera.fx
         self._powers = [_edge_strength(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)) for color, _ in pairs]
         self.scale = camera.width / 640.0
-        """Width of the colour images against the 640 px that settings speak of."""
+        """Width of the colour images against the 640 px that settings refer to."""
         self._same_size = all(depth.shape == color.shape[:2] for color, depth in pairs)
         fx, fy, cx, cy = depth_intrinsics
         points: list[Array] = []

@@ -36,15 +36,15 @@ def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, 
     if options.distortion is not None:
         optics = replace(optics, fisheye=False)
     if options.intrinsics is not None:
-        optics = replace(optics, intrinsics_size=None, said=True)
+        optics = replace(optics, intrinsics_size=None, by_user=True)
     if options.depth_intrinsics is not None:
         optics = replace(optics, depth_intrinsics_size=None)
     if optics.T_color_depth is not None and optics.depth_intrinsics is None:
         optics = replace(optics, depth_intrinsics=optics.intrinsics)
-        notes.append("the depth camera is given the colour camera's intrinsics; --depth-intrinsics says otherwise")
+        notes.append("the depth camera is assumed to have the intrinsics of colour; --depth-intrinsics changes that")
     if optics.depth_intrinsics is not None and optics.T_color_depth is None:
         optics = replace(optics, T_color_depth=np.eye(4))
-        notes.append("depth and colour camera are taken to stand in one place; --depth-to-color says otherwise")
+        notes.append("depth and colour camera are assumed to be at the same place; --depth-to-color changes that")
     return optics, tuple(notes)
 
 
@@ -128,10 +128,10 @@ def build_rig(
     Frames larger than `max_side` are reduced, and the camera with them; see `SourceOptions.max_side`.
     """
     if optics.distortion and optics.intrinsics is None:
-        raise SourceError("a lens distortion without a camera means nothing; give --intrinsics fx,fy,cx,cy")
+        raise SourceError("a lens distortion needs a camera; give --intrinsics fx,fy,cx,cy")
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
     color_size = working_size(stored_size, limit)
-    if optics.intrinsics is not None and not optics.said:
+    if optics.intrinsics is not None and not optics.by_user:
         _check_size(optics.intrinsics, optics.intrinsics_size or stored_size)
     stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
     if stated is not None and optics.fisheye:
@@ -169,8 +169,8 @@ def _registration(
         return None
     if camera is None:
         raise SourceError("depth has a camera of its own but the colour camera has none; give --intrinsics fx,fy,cx,cy")
-    said = _camera(optics.depth_intrinsics, optics.depth_intrinsics_size or depth_size, "depth intrinsics", ())
-    depth_camera = _of_size(said, depth_size, "the depth images")
+    given = _camera(optics.depth_intrinsics, optics.depth_intrinsics_size or depth_size, "depth intrinsics", ())
+    depth_camera = _of_size(given, depth_size, "the depth images")
     assert depth_camera is not None and optics.T_color_depth is not None
     same = camera.pinhole() == depth_camera and np.allclose(optics.T_color_depth, np.eye(4), atol=1e-9)
     return None if same else DepthReprojection(depth_camera, camera, optics.T_color_depth)

@@ -57,11 +57,11 @@ class Record3dWriter:
 
     def _metadata(self) -> dict[str, object]:
         c = self._camera
-        said: dict[str, object] = {"w": c.width, "h": c.height, "fps": self._fps, "poses": self._poses}
-        said |= {"K": [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1], "frameTimestamps": self._times}
+        metadata: dict[str, object] = {"w": c.width, "h": c.height, "fps": self._fps, "poses": self._poses}
+        metadata |= {"K": [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1], "frameTimestamps": self._times}
         if self._depth_size is not None:
-            said |= {"dw": self._depth_size[1], "dh": self._depth_size[0]}
-        return said
+            metadata |= {"dw": self._depth_size[1], "dh": self._depth_size[0]}
+        return metadata
 
 
 def _row(T_world_arkit: NDArray[np.float64]) -> list[float]:

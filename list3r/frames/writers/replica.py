@@ -13,7 +13,7 @@ UNITS_PER_M = 6553.5
 
 
 class ReplicaWriter:
-    """`results/frame*.jpg`, `results/depth*.png`, `traj.txt` and `cam_params.json`, numbered anew from 0.
+    """`results/frame*.jpg`, `results/depth*.png`, `traj.txt` and `cam_params.json`, numbered again from 0.
 
     Frames without a pose are left out, because `traj.txt` has a row for every picture.
     """

@@ -26,17 +26,17 @@ class TransformsWriter:
         if frame.T_source_cam is None:
             return
         stem = f"frame_{frame.index:06d}"
-        said: dict[str, Any] = {"file_path": f"images/{stem}.jpg"}
-        put(self._folder / said["file_path"], jpeg(frame.color))
+        entry: dict[str, Any] = {"file_path": f"images/{stem}.jpg"}
+        put(self._folder / entry["file_path"], jpeg(frame.color))
         if frame.depth is not None:
-            said["depth_file_path"] = f"depth/{stem}.png"
-            put(self._folder / said["depth_file_path"], png16(frame.depth, UNITS_PER_M))
-        said["transform_matrix"] = (frame.T_source_cam @ OPENGL_TO_OPENCV).tolist()
-        self._frames.append(said)
+            entry["depth_file_path"] = f"depth/{stem}.png"
+            put(self._folder / entry["depth_file_path"], png16(frame.depth, UNITS_PER_M))
+        entry["transform_matrix"] = (frame.T_source_cam @ OPENGL_TO_OPENCV).tolist()
+        self._frames.append(entry)
 
     def close(self) -> None:
         """Write the list of frames with the camera."""
         c = self._camera
-        said = {"camera_model": "OPENCV", "w": c.width, "h": c.height}
-        said |= {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "depth_unit_scale_factor": 1.0 / UNITS_PER_M}
-        put(self._folder / "transforms.json", json.dumps({**said, "frames": self._frames}, indent=1))
+        transforms = {"camera_model": "OPENCV", "w": c.width, "h": c.height}
+        transforms |= {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "depth_unit_scale_factor": 1.0 / UNITS_PER_M}
+        put(self._folder / "transforms.json", json.dumps({**transforms, "frames": self._frames}, indent=1))

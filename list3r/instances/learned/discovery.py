@@ -17,7 +17,7 @@ from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.planes import Plane, estimate_up, find_planes
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
-from list3r.instances.learned.doubt import DoubtSettings, voxel_doubt, without_bends, without_slivers
+from list3r.instances.learned.depth_errors import DepthErrorSettings, voxel_doubt, without_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
 from list3r.instances.learned.network import Weights
 from list3r.instances.learned.things import ThingVerdicts, names_of
@@ -49,7 +49,7 @@ class LearnedSettings:
     plane_area_m2: float = 0.25
     """Smallest flat surface looked for, from which gravity is told and structure is parted."""
     cut: CutSettings = field(default_factory=CutSettings)
-    doubt: DoubtSettings = field(default_factory=DoubtSettings)
+    doubt: DepthErrorSettings = field(default_factory=DepthErrorSettings)
     """Of computed depth."""
 
 

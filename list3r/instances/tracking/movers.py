@@ -16,8 +16,8 @@ from list3r.instances.settings import FEATURE_SPACE, MoverInstanceSettings
 from list3r.instances.tracking.reprojection import encode_labels
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, MotionTrack, Support
 from list3r.reconstruction.base import Reconstruction, backproject
-from list3r.reconstruction.motion.follow import Blob, measure_blob, middles
 from list3r.reconstruction.motion.moving import SmallFrames
+from list3r.reconstruction.motion.moving_tracks import Blob, measure_blob, middles
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 

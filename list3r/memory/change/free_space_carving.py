@@ -18,7 +18,7 @@ from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.store.store import Store
 
 _KEPT = 64
-"""Chunks whose depth pictures are kept at hand."""
+"""Chunks whose depth pictures are kept in memory."""
 
 
 class FreeSpaceCarving:

@@ -1,7 +1,7 @@
-"""What was told of changes when a session last ended, in terms of local instances, which never change.
+"""The changes as found when a session last ended, in terms of local instances, which never change.
 
 Until the next session ends it stands: its chunks come to the library by overlap alone, what had moved stays one
-instance whose box is where it was last, and what had events stays shown. Then all is found anew (`change.detection`).
+instance whose box is where it was last, and what had events stays shown. Then all is found again (`change.detection`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ChangeLedger:
     """The matching of the sessions that have ended."""
 
     session: int
-    """The last session that it tells of."""
+    """The last session that it covers."""
     moved: tuple[MovedInstance, ...] = ()
     with_events: frozenset[Key] = frozenset()
     """A local instance of every instance that has an event."""
@@ -62,7 +62,7 @@ class ChangeLedger:
         return tuple(group)
 
     def keys(self) -> set[Key]:
-        """Return all local instances that it speaks of."""
+        """Return all local instances that it concerns."""
         return {k for m in self.moved for place in m.places for k in place} | self.with_events
 
     def joined(
@@ -116,9 +116,9 @@ def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> M
 
 def read_ledger(store: Store, chunks: Sequence[ChunkRow]) -> ChangeLedger | None:
     """Return what stands of changes; None where several sessions have ended and nothing is written down of them."""
-    told = store.facts[_LEDGER]
-    if told is not None:
-        return told
+    stored = store.facts[_LEDGER]
+    if stored is not None:
+        return stored
     complete = {s.session_id for s in store.sessions.all() if s.state == "complete"}
     ended = sorted({c.session_id for c in chunks} & complete)
     return ChangeLedger(ended[0] if ended else 0) if len(ended) < 2 else None

@@ -41,7 +41,7 @@ class _Move:
 
 
 class ChangeMatching:
-    """Tells what each session has changed; the result stands when all are told, in order."""
+    """Finds what each session has changed; the result is complete when all sessions were taken, in order."""
 
     def __init__(
         self, places: Places, found: OverlapGroups, constraints: Constraints, settings: ChangeSettings
@@ -212,7 +212,7 @@ class ChangeMatching:
     def _still_there(self, placed: _PlacedInstance, session: int, found: PlaceVisibility) -> None:
         placed.state = "present"
         box = self._p.box(placed.now, session, before=True, stayed=True)
-        reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be told)"
+        reason = f"a surface is measured where it was ({1 - found.free:.0%} of what could be judged)"
         self._record(
             placed,
             Change(self._first(placed), session, "seen_again", box, box, found.frames, 0.5 * (1 - found.free), reason),
@@ -221,7 +221,7 @@ class ChangeMatching:
     def _remove(self, placed: _PlacedInstance, session: int, found: PlaceVisibility) -> None:
         placed.state = "removed"
         box = self._p.box(placed.now, session, before=True)
-        reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be told)"
+        reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be judged)"
         self._record(
             placed, Change(self._first(placed), session, "removed", box, None, found.frames, self._sure(found), reason)
         )
@@ -250,7 +250,7 @@ class ChangeMatching:
         kind = "seen_again" if stayed else "moved"
         reason = f"gone from its place and found {distance:.2f} m away, of the same look and size"
         if stayed:
-            reason = f"found {distance:.2f} m away, which is within what the sessions may lie off each other"
+            reason = f"found {distance:.2f} m away, which is within the uncertainty of how the sessions lie"
         scores = {"distance": round(distance, 3), "deviations": round(move.deviations, 3), "chance": move.chance}
         self._decisions.append(MergeDecision("merge", f"{a[0]}:{a[1]}", f"{b[0]}:{b[1]}", scores, reason))
         sure = self._sure(found) * move.chance

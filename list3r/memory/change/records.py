@@ -48,7 +48,7 @@ class ChangeSettings:
     side_most: float = 3.0
     """Squared deviations that one side counts at most: what hides a part of an instance says nothing against it,"""
     side_longer: float = 3.0
-    """unless another side is longer than that of the whole by so many deviations."""
+    """unless another side is longer than that of the whole by this many deviations."""
     least_changed: float = 0.3
     """Share of an instance's points that must have changed, for the others to be left out of its size."""
     foot_m: float = 0.04
@@ -60,7 +60,7 @@ class ChangeSettings:
     most_deviations: float = 12.5
     """Sum of squared deviations up to which two are one instance."""
     placed_deviations: float = 2.0
-    """Deviations of how surely the sessions lie on each other: within so many nothing has moved, and what is gone must
+    """Deviations of how surely the sessions lie on each other. Within this many nothing moved, and what is gone must
     be gone wherever the session may lie (decision 0058)."""
     replaced: float = 0.4
     """Share of a new instance's surface that must lie where an instance stood that is gone, to be new there;"""

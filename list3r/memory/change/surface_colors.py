@@ -1,4 +1,4 @@
-"""What colour tells of two sessions: of surfaces that lie on one another, and of two instances wherever they are.
+"""What colour says about two sessions: of surfaces that lie on one another, and of two instances wherever they are.
 
 Depth cannot tell a book from the book that lies in its place. Their surfaces meet, so the colours of points that meet
 are compared, in the light of the later session: what all surfaces that meet have in common is the light, and how far

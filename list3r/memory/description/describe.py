@@ -86,7 +86,7 @@ def describe(shape: str, color: str, size: Array, unit: float, *, metric: bool, 
     """Return the description of an instance: "small white cylinder, 9 cm".
 
     `shape` is the `shape_word` and `size` (3,) the full edge lengths of its box, world units; `unit` is what a metre is
-    about, also where the memory is not metric, and then no centimetres are told.
+    about, also where the memory is not metric, and then no centimetres are given.
     """
     longest = float(np.max(size))
     if structure is not None:

@@ -6,7 +6,7 @@ import re
 from functools import lru_cache
 
 VERSION = 1
-"""Goes up with every change of what words an instance bears: the index of words in a file is then made anew."""
+"""Goes up with every change of what words an instance has: the index of words in a file is then made again."""
 
 _SYNONYMS = {
     "ground": "floor",
@@ -30,21 +30,21 @@ _SYNONYMS = {
 
 
 def vocabulary(label: str | None, structure: str | None, description: str, color_name: str) -> dict[str, float]:
-    """Return the words that an instance bears, singular and in one word for many, with how well each names it, in (0,
+    """Return the words that an instance has, singular and in one word for many, with how well each names it, in (0,
     1].
 
     Of the description only what stands before the first comma counts.
     """
     out: dict[str, float] = {}
-    told = split_words(description.split(",")[0])
+    kind = split_words(description.split(",")[0])
     color = split_words(color_name)
-    for score, words in ((1.0, split_words(label or "")), (0.9, split_words(structure or "")), (0.8, told)):
+    for score, words in ((1.0, split_words(label or "")), (0.9, split_words(structure or "")), (0.8, kind)):
         for word in words:
             out[word] = max(out.get(word, 0.0), score)
     for word in color:
         out[word] = 1.0 if len(color) == 1 else 0.9
     if label is None:
-        for word in told[-1:]:
+        for word in kind[-1:]:
             out[word] = max(out[word], 0.9)
     return out
 

@@ -75,7 +75,7 @@ class _Chunks(dict[int, SettledRow]):
 
     def __missing__(self, chunk_id: int) -> SettledRow:
         raise MemoryFileError(
-            f"{self._path} speaks of chunk {chunk_id}, which is not placed or said to add nothing; "
+            f"{self._path} refers to chunk {chunk_id}, which is neither placed nor marked as redundant; "
             f"run `list3r verify {self._path}`, `list3r repair {self._path}` saves what is sound"
         )
 
@@ -93,7 +93,7 @@ class Region:
         """Those of them that are not redundant as a whole."""
         if self.settled and not self.rows:
             file = store.path
-            raise MemoryFileError(f"every chunk of {file} is said to be redundant; `list3r repair {file}` mends that")
+            raise MemoryFileError(f"every chunk of {file} is marked as redundant; `list3r repair {file}` fixes that")
         self._extents: Array | None = None
         self._T_world_graph = store.facts.S_world_graph
         self._carving = FreeSpaceCarving(store, settings.changes.visibility)

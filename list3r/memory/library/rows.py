@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Swatch, color_words, main_color
 from list3r.memory.description.describe import describe
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Array, OrientedBox, Sim3, rotation_exp
+from list3r.memory.geometry import Array, OrientedBox, Sim3, rotation_exp, stack
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.instances import DerivedInstance
 from list3r.memory.library.rules import World
-from list3r.memory.library.settled_poses import stacked
 from list3r.memory.library.uncertainty import position_sigmas
 from list3r.memory.overlap.pair_scores import Key, PairScores
 from list3r.memory.records import Instance, MergeDecision
@@ -126,8 +125,8 @@ def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[i
     others = {n: a for (n, a), move in zip(known.items(), elsewhere, strict=True) if move}
     for some in _batches(sorted(others)):
         instances = store.instances.of(some)
-        before = stacked([others[i.id].S_exact_settled for i in instances])
-        now = stacked([exact[others[i.id].chunk_id] for i in instances])
+        before = stack([others[i.id].S_exact_settled for i in instances])
+        now = stack([exact[others[i.id].chunk_id] for i in instances])
         by = now.apply(before.inverse().apply(_centers(instances)[:, None]))[:, 0] - _centers(instances)
         there = [
             replace(i, center=i.center + d, aabb=i.aabb + d, box=replace(i.box, center=i.box.center + d))
@@ -145,8 +144,8 @@ def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None
     anchors = {n: a for n, a in store.library.anchors.all().items() if a.chunk_id in moves}
     for some in _batches(sorted(anchors)):
         instances = store.instances.of(some)
-        exact = stacked([anchors[i.id].S_exact_settled for i in instances])
-        by = stacked([moves[anchors[i.id].chunk_id] for i in instances])
+        exact = stack([anchors[i.id].S_exact_settled for i in instances])
+        by = stack([moves[anchors[i.id].chunk_id] for i in instances])
         center, aabb = _centers(instances)[:, None], np.array([i.aabb for i in instances])
         size, rotation = np.array([i.box.size for i in instances]), np.array([i.box.rotation for i in instances])
         derived = exact.inverse().apply(center)

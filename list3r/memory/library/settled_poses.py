@@ -4,13 +4,13 @@ others by a little, and what is derived from a chunk need not be derived again f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Array, Sim3
+from list3r.memory.geometry import Array, Sim3, stack, take
 from list3r.memory.overlap.summaries import ChunkSummary
 from list3r.memory.records import ChunkRow
 from list3r.memory.store.store import Store
@@ -150,10 +150,10 @@ def carry(store: Store, T_world_graph: Sim3, settings: CarrySettings) -> Carried
     if any(rows[c.chunk_id].component != c.component for c in placed):
         return None
     ids, extents = np.fromiter(rows, np.int64, len(rows)), np.array([r.extent for r in rows.values()])
-    there, world = stacked([r.S_graph_chunk for r in rows.values()]), stacked([c.S_world_chunk for c in placed])
+    there, world = stack([r.S_graph_chunk for r in rows.values()]), stack([c.S_world_chunk for c in placed])
     here = _world_of_graph(store).inverse() @ world
     by, moves = here @ there.inverse(), world @ (T_world_graph @ there).inverse()
-    frames = stacked([T_world_graph]), stacked([_world_of_graph(store)])
+    frames = stack([T_world_graph]), stack([_world_of_graph(store)])
     if _stirred(there, here, settings).sum() <= _FEW and not _stirred(*frames, settings).any():
         return None
     pairs = np.searchsorted(ids, np.array(_compared(store, rows), np.int64).reshape(-1, 2))
@@ -168,31 +168,17 @@ def carry(store: Store, T_world_graph: Sim3, settings: CarrySettings) -> Carried
     chunks = [(n, k, rows[k].component) for n, k in enumerate(ids.tolist())]
     beside = _beside(pairs, others)
     return Carried(
-        rows={k: SettledRow(part, at(here, n), boxes[n], slack[n]) for n, k, part in chunks},
-        moves={k: at(moves, n) for n, k, _ in chunks},
+        rows={k: SettledRow(part, take(here, n), boxes[n], slack[n]) for n, k, part in chunks},
+        moves={k: take(moves, n) for n, k, _ in chunks},
         dirty=dirty,
         before={
-            k: SettledRow(part, (S := at(by, beside[n])) @ at(there, n), carried_boxes(S, extents[n]))
+            k: SettledRow(part, (S := take(by, beside[n])) @ take(there, n), carried_boxes(S, extents[n]))
             for n, k, part in chunks
             if k in dirty
         },
         apart=frozenset(p for p in apart if dirty.isdisjoint(p)),
         together=frozenset(p for p in together if dirty.isdisjoint(p)),
     )
-
-
-def stacked(poses: Sequence[Sim3]) -> Sim3:
-    """Return similarities as one, batched."""
-    return Sim3(
-        np.array([float(S.scale) for S in poses]),
-        np.array([S.rotation for S in poses]).reshape(-1, 3, 3),
-        np.array([S.translation for S in poses]).reshape(-1, 3),
-    )
-
-
-def at(poses: Sim3, n: int | NDArray[np.int64]) -> Sim3:
-    """Return one or some of batched similarities."""
-    return Sim3(poses.scale[n], poses.rotation[n], poses.translation[n])
 
 
 def carried_boxes(S: Sim3, boxes: Array) -> Array:
@@ -248,7 +234,7 @@ def _between(by: Sim3, extents: Array, pairs: NDArray[np.int64]) -> tuple[Array,
     u, v = pairs.T
     low, high = np.maximum(extents[u, 0], extents[v, 0]), np.minimum(extents[u, 1], extents[v, 1])
     middle = np.nan_to_num((low + high) / 2.0, posinf=0.0, neginf=0.0)[:, None]
-    shift = np.linalg.norm(at(by, u).apply(middle) - at(by, v).apply(middle), axis=-1)[:, 0]
+    shift = np.linalg.norm(take(by, u).apply(middle) - take(by, v).apply(middle), axis=-1)[:, 0]
     cosine = (np.einsum("nij,nij->n", by.rotation[u], by.rotation[v]) - 1.0) / 2.0
     return shift, _degrees(cosine)
 

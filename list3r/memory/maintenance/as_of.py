@@ -1,8 +1,8 @@
-"""The memory as it was after an earlier session, for every question to be asked of.
+"""The memory as it was after an earlier session, for every question.
 
 A connection of its own to the same file, in which temporary tables and views stand before those of the file: nothing
 is written, what sessions saw later is not there, and what they moved is where it was. Sizes and words are those of
-today. Relations among what has not changed since are those of the file; the others are found anew.
+today. Relations among what has not changed since are those of the file; the others are found again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from list3r.memory.geometry import Array
 from list3r.memory.library.rules import settings_of
 from list3r.memory.maintenance.history import world_at
-from list3r.memory.maintenance.shown import put_before, store_shown
+from list3r.memory.maintenance.temporary_views import put_before, store_shown
 from list3r.memory.records import Instance, Relation
 from list3r.memory.relations import predicates
 from list3r.memory.relations.instance_geometry import InstanceGeometry
@@ -83,9 +83,9 @@ def _found_anew(past: Store, then: Sequence[Instance], changed: set[int], vertic
         near = [i for i in here if any(_gap(i.aabb, m.aabb) <= _REACH_M for m in moved)]
         middle = np.mean([i.center for i in here], axis=0) if here else np.zeros(3)
         instances = [b for i in near if (b := _body(past, i, middle)) is not None]
-        told = settings_of(past, None).relations
+        settings = settings_of(past, None).relations
         upright = vertical and component == first
-        found = predicates.relations(instances, gravity_known=upright, settings=told) if moved else []
+        found = predicates.relations(instances, gravity_known=upright, settings=settings) if moved else []
         out += [r for r in found if r.subject in changed or r.object in changed]
     return out
 

@@ -2,7 +2,7 @@
 
 Each is one transaction and one log entry.
 
-An edit is written down in terms of local instances (chunk:local), which never change; then the library is derived anew
+An edit is written down in terms of local instances (chunk:local), which never change; then the library is derived again
 under all edits that stand (`memory.constraints`), and so it is whenever a chunk arrives later.
 """
 
@@ -59,7 +59,7 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
     with store.transaction():
         first, second = sorted((store.ids.resolve(a), store.ids.resolve(b)))
         if first == second:
-            raise OptionError(f"{a} and {b} are one instance already, #{first}")
+            raise OptionError(f"{a} and {b} are already one instance, #{first}")
         if store.instances.get(first).component != store.instances.get(second).component:
             raise OptionError(
                 f"#{first} and #{second} lie in parts of the memory that were never joined, each with its own frame of "
@@ -71,10 +71,10 @@ def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport
 
 
 def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, author: str | None = None) -> EditReport:
-    """Say that an instance is two: `out`, local instances (chunk id, local id) of it, and the rest.
+    """Split an instance into two: `out`, local instances (chunk id, local id) of it, and the rest.
 
-    Without `out` it is parted where the evidence parts it best. The larger part keeps the id, the other gets a new one.
-    Raises `UnknownIdError`, and `OptionError` when there is nothing to part or `out` is not a part of it.
+    Without `out` it is split where the evidence is strongest. The larger part keeps the id, the other gets a new one.
+    Raises `UnknownIdError`, and `OptionError` when there is nothing to split or `out` is not a part of it.
     """
     with store.transaction():
         known = store.ids.resolve(instance_id)
@@ -85,8 +85,8 @@ def split(store: Store, instance_id: int, out: Sequence[Key] | None = None, auth
         leaving = _checked_part(known, keys, out) if out is not None else propose_split(store, keys)
         staying = tuple(k for k in keys if k not in set(leaving))
         edit = _edit("split", (staying, tuple(sorted(leaving))), before, author)
-        told = ", ".join(map(key_name, edit.parts[1]))
-        return _carry_out(store, edit, (f"#{known}", told), f"{edit.author} split #{known}: {told} left it")
+        names = ", ".join(map(key_name, edit.parts[1]))
+        return _carry_out(store, edit, (f"#{known}", names), f"{edit.author} split #{known}: {names} left it")
 
 
 def label(store: Store, instance_id: int, text: str | None, author: str | None = None) -> EditReport:
@@ -96,7 +96,7 @@ def label(store: Store, instance_id: int, text: str | None, author: str | None =
         known = store.ids.resolve(instance_id)
         before = _as_they_are(store, [known])
         edit = replace(_edit("label", (before[0][2],), before, author), text=cleaned)
-        reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} took the label of #{known}"
+        reason = f"{edit.author} named #{known} {cleaned!r}" if cleaned else f"{edit.author} unlabelled #{known}"
         edit = _write_down(store, edit, (f"#{known}", cleaned or ""), reason)
         store.instances.set_labels({known: cleaned})
         return EditReport(edit.entry, "label", (known,), (), (), (), reason)
@@ -116,21 +116,21 @@ def scale(store: Store, anchor: str, author: str | None = None) -> EditReport:
 
     The last anchor that stands counts. Raises `OptionError` where it cannot be measured or the memory is metric.
     """
-    said = parse_anchor(_line(anchor, "anchor"))
+    parsed = parse_anchor(_line(anchor, "anchor"))
     with store.transaction():
-        found = measure(store, said)
-        what = f"#{store.ids.resolve(said.instance_id)}" if said.kind in ("size", "height") else said.kind
+        found = measure(store, parsed)
+        what = f"#{store.ids.resolve(parsed.instance_id)}" if parsed.kind in ("size", "height") else parsed.kind
         edit = _edit("scale", (found.keys,) if found.keys else (), (), author)
-        edit = replace(edit, text=said.text, scale=(found.chunk_id, found.metres_per_unit))
-        reason = f"{edit.author} anchored the scale: {said.text} where it was {found.length:.4g} units"
-        return _carry_out(store, edit, (what, said.text), reason)
+        edit = replace(edit, text=parsed.text, scale=(found.chunk_id, found.metres_per_unit))
+        reason = f"{edit.author} anchored the scale: {parsed.text} where it was {found.length:.4g} units"
+        return _carry_out(store, edit, (what, parsed.text), reason)
 
 
 def undo(store: Store, entry: int | None = None, author: str | None = None) -> EditReport:
     """Take back an edit, or a decision of the merge log, by its entry; the last edit that stands without one.
 
     Undoing an undo brings the edit back. Ids that had retired come back. Raises `OptionError` for an entry that there
-    is not, that is undone already, or that decided nothing.
+    is not, that is already undone, or that decided nothing.
     """
     with store.transaction():
         edits = store.edits.all()
@@ -144,13 +144,13 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
         if chosen is None:
             return _undo_decision(store, entry, author)
         if chosen not in in_force:
-            raise OptionError(f"entry {entry} is undone already; undo the undo to bring it back")
+            raise OptionError(f"entry {entry} is already undone; undo the undo to bring it back")
         touched = sorted({k for _, _, keys in chosen.before for k in keys})
         edit = replace(_edit("undo", (), _owners(store, touched), author), target=entry)
         what = f"the undo of entry {chosen.target}" if chosen.kind == "undo" else f"the {chosen.kind}"
-        reason = f"{edit.author} took back {what} of entry {entry}"
+        reason = f"{edit.author} undid {what} of entry {entry}"
         if chosen.kind == "undo":
-            reason = f"{edit.author} took back the undo of entry {chosen.target}"
+            reason = f"{edit.author} undid the undo of entry {chosen.target}"
         return _carry_out(store, edit, (f"entry {entry}", ""), reason, bring_back=chosen.before)
 
 
@@ -164,14 +164,14 @@ def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
         raise OptionError(f"the log has no entry {entry}; `list3r merges {store.path}` shows all")
     d = found.decision
     if d.kind not in ("merge", "refuse"):
-        raise OptionError(f"entry {entry} ({d.kind}) only tells what became of ids; undo the merge that led to it")
+        raise OptionError(f"entry {entry} ({d.kind}) only records what became of ids; undo the merge that led to it")
     a, b = _key(d.a, found), _key(d.b, found)
     before = _owners(store, [a, b])
     one = len(before) == 1 and len(before[0][2]) > 0 and {a, b} <= set(before[0][2])
     if one != (d.kind == "merge"):
         raise OptionError(f"entry {entry} no longer applies: {d.a} and {d.b} are {'one' if one else 'two'} now")
     edit = replace(_edit("split" if one else "merge", ((a,), (b,)), before, author), target=entry)
-    reason = f"{edit.author} took back the {d.kind} of entry {entry}"
+    reason = f"{edit.author} undid the {d.kind} of entry {entry}"
     return _carry_out(store, edit, (d.a, d.b), reason)
 
 
@@ -230,7 +230,7 @@ def _write_down(store: Store, edit: Edit, names: tuple[str, str], reason: str) -
 
 
 def _carry_out(store: Store, edit: Edit, names: tuple[str, str], reason: str, bring_back: Before = ()) -> EditReport:
-    """Write the edit down, derive the library anew, and see to it that every id still resolves."""
+    """Write the edit down, derive the library again, and see to it that every id still resolves."""
     if any(not keys for _, _, keys in edit.before):
         raise OptionError(
             f"{store.path} does not hold the local instances of {names[0]}; only its label can be changed"

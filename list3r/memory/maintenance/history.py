@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
 from list3r.memory.records import ChangeEvent, Instance
 from list3r.memory.store.store import Store
 
@@ -20,9 +19,7 @@ def world_at(store: Store, session_id: int) -> list[Instance]:
     those of today, which rest on all that was ever seen of an instance. Raises `OptionError` for a session that there
     is not.
     """
-    sessions = [s.session_id for s in store.sessions.all()]
-    if session_id not in sessions:
-        raise OptionError(f"{store.path} has no session {session_id}; it has {', '.join(map(str, sessions))}")
+    store.sessions.check(session_id)
     owner = {c.chunk_id: c.session_id for c in store.chunks.all()}
     seen: dict[int, set[int]] = {}
     for o in store.observations.all():
@@ -33,11 +30,11 @@ def world_at(store: Store, session_id: int) -> list[Instance]:
     latest = _latest(store, session_id)
     out = []
     for instance in store.instances.all():
-        told = story.get(instance.id, [])
-        known = seen.get(instance.id, set()) | {e.session_id for e in told}
+        events = story.get(instance.id, [])
+        known = seen.get(instance.id, set()) | {e.session_id for e in events}
         if known and min(known) <= session_id:
-            state = _state(told, seen.get(instance.id, set()), session_id, latest.get(instance.component, session_id))
-            out.append(replace(_where(instance, told, session_id), state=state))
+            state = _state(events, seen.get(instance.id, set()), session_id, latest.get(instance.component, session_id))
+            out.append(replace(_where(instance, events, session_id), state=state))
     return out
 
 
@@ -50,8 +47,8 @@ def _latest(store: Store, session_id: int) -> dict[int, int]:
     return out
 
 
-def _state(told: list[ChangeEvent], seen: set[int], session_id: int, latest: int) -> str:
-    before = [e for e in told if e.session_id <= session_id]
+def _state(events: list[ChangeEvent], seen: set[int], session_id: int, latest: int) -> str:
+    before = [e for e in events if e.session_id <= session_id]
     if before and before[-1].kind == "removed":
         return "removed"
     if before and before[-1].session_id == latest:
@@ -59,9 +56,9 @@ def _state(told: list[ChangeEvent], seen: set[int], session_id: int, latest: int
     return "present" if latest in seen else "unseen"
 
 
-def _where(instance: Instance, told: list[ChangeEvent], session_id: int) -> Instance:
+def _where(instance: Instance, events: list[ChangeEvent], session_id: int) -> Instance:
     """Return the instance where it was before the first move after the session."""
-    moves = [e for e in told if e.session_id > session_id and e.kind == "moved" and e.from_box is not None]
+    moves = [e for e in events if e.session_id > session_id and e.kind == "moved" and e.from_box is not None]
     if not moves:
         return instance
     box = moves[0].from_box

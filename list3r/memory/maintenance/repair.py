@@ -1,4 +1,4 @@
-"""A damaged memory to a sound one: every row that is as it was written is kept, the rest is derived anew or named."""
+"""A damaged memory to a sound one: every row that is as it was written is kept, the rest is derived again or named."""
 
 from __future__ import annotations
 
@@ -27,10 +27,12 @@ from list3r.memory.store.checksums import (
 )
 from list3r.memory.store.file import (
     check_beside,
+    check_numbers,
     check_schema,
     connected,
     fold_in,
     migrate,
+    numbers,
     protect,
     rename_exclusively,
 )
@@ -38,11 +40,11 @@ from list3r.memory.store.lock import WriterLock
 from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
 from list3r.memory.store.rows.codec import checksum, unpack
 from list3r.memory.store.rows.values import bad_values
-from list3r.memory.store.schema import APPLICATION_ID, SCHEMA_VERSION
+from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
-"""Tables that consolidation writes; a row lost there is written anew."""
+"""Tables that consolidation writes; a row lost there is written again."""
 _PASSING = ("settled", "overlaps", "members", "anchors", "redundant", "looks")
 """Tables that consolidation goes on with; without them it derives the library as a whole."""
 _OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
@@ -65,7 +67,7 @@ class RepairReport:
     lost: dict[str, list[str]] = field(default_factory=dict)
     """What could not be saved: by kind (chunks, frames, keyframes, ...), names such as `3` or `1:120`."""
     rebuilt: bool = False
-    """Whether instances and relations were derived anew from what was saved."""
+    """Whether instances and relations were derived again from what was saved."""
     chunks: int = 0
     """Chunks in the sound file."""
     instances: int = 0
@@ -143,8 +145,8 @@ def _copy(path: Path, copy: Path) -> None:
         free = shutil.disk_usage(copy.parent).free
         if 2 * size > free:
             raise MemoryFileError(
-                f"{path} takes {size / 1e6:.0f} MB, and so does what is saved of it; {copy.parent.parent} has "
-                f"{free / 1e6:.0f} MB free: free some space, or name another folder by --out"
+                f"{path} takes {size / 1e6:.0f} MB, and so may its repaired copy; {copy.parent.parent} has only "
+                f"{free / 1e6:.0f} MB free: free some space, or name another folder with --out"
             )
         for end in ("", "-wal", "-journal"):
             if Path(f"{path}{end}").exists():
@@ -209,19 +211,9 @@ def _drop_bad_rows(database: sqlite3.Connection, version: int, lost: _Lost) -> N
 
 
 def _check_ours(path: Path, database: sqlite3.Connection) -> None:
-    """Raises `MemoryFileError` for a file that is whole, but of a later program or a stranger's."""
-    try:
-        application, version = (
-            int(database.execute(f"PRAGMA {n}").fetchone()[0]) for n in ("application_id", "user_version")
-        )
-    except FAILURES:
-        return
-    if application != APPLICATION_ID:
-        raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory")
-    if version > SCHEMA_VERSION:
-        raise MemoryFileError(
-            f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
-        )
+    """Raise `MemoryFileError` for a file that can be read but belongs to another program or a newer version."""
+    with contextlib.suppress(*FAILURES):
+        check_numbers(path, *numbers(database))
 
 
 # ------------------------------------------------------------------------------------------- rows
@@ -234,14 +226,14 @@ class _Lost:
     keys: dict[str, dict[Row, None]] = field(default_factory=dict)
     unnamed: dict[str, int] = field(default_factory=dict)
     instances: set[int] = field(default_factory=set)
-    """Ids that the damaged file told of."""
+    """Ids that the damaged file names."""
 
     def add(self, table: str, key: Row) -> None:
         self.keys.setdefault(table, {})[key] = None
 
 
 def _salvage(damaged: sqlite3.Connection, store: Store, lost: _Lost) -> None:
-    """Write all rows that are as they were written, and what hangs together with them, into an empty store."""
+    """Write all rows that are as they were written, and what belongs to them, into an empty store."""
     tables = {name: table for name, table in summed_tables().items() if name not in _PASSING}
     kept = {name: _sound_rows(damaged, table, lost) for name, table in tables.items()}
     lost.instances = {key[0] for key in (*kept["instances"], *lost.keys.get("instances", ()))}
@@ -411,7 +403,7 @@ def _needs_deriving(lost: _Lost) -> bool:
 
 
 def _derive(store: Store) -> None:
-    """The library anew from the chunks: ids stay where the observations of an instance, or the row itself, stayed."""
+    """Derive the library again from the chunks: ids stay where the observations or the row of an instance stayed."""
     with store.transaction():
         if not store.chunks.all():
             for name in _DERIVED:

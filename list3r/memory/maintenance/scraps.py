@@ -1,4 +1,4 @@
-"""Scraps as instances: what is too seldom one thing to be listed, made of what chunks kept of it when somebody asks.
+"""Scraps as instances: what is too unlikely to be one thing to be listed, made on demand of what chunks kept of it.
 
 Nothing else is derived from scraps: what is listed, its relations and its changes are the same with and without them.
 """
@@ -74,8 +74,8 @@ class _Placed:
     def _shapes_of(self, k: int) -> ChunkShapes:
         chunk, unit = self._store.chunks.get(k), self._summaries[k].unit
         nodes = self._store.local_instances.nodes([k], scraps=True)
-        told = self._settings.shapes
-        return chunk_shapes(nodes, chunk.image_size, unit, told, chunk_id=k, session_id=chunk.session_id)
+        settings = self._settings.shapes
+        return chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=k, session_id=chunk.session_id)
 
     def _same(self, a: ChunkShapes, b: ChunkShapes) -> NDArray[np.int64]:
         """Return positions (i, j) of what of two chunks lies on each other. Shape (M, 2)."""

@@ -1,5 +1,5 @@
-"""Groups of local instances that are not listed, because too little speaks for them, made instances of when somebody
-asks. As of scraps, nothing else is derived from them.
+"""Instances of groups that are not listed, because there is too little evidence for them, made on demand. As with
+scraps, nothing else is derived from them.
 """
 
 from __future__ import annotations

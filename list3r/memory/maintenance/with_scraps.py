@@ -1,4 +1,4 @@
-"""The memory with what it keeps but does not list, for every question to be asked of."""
+"""The memory with what it keeps but does not list, for every question."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.rules import WORLD
 from list3r.memory.maintenance.scraps import derive_scraps
-from list3r.memory.maintenance.shown import put_before, store_shown
+from list3r.memory.maintenance.temporary_views import put_before, store_shown
 from list3r.memory.maintenance.unlisted import derive_unlisted
 from list3r.memory.records import Observation
 from list3r.memory.store.rows.columns import UNREADABLE

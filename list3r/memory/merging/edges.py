@@ -103,7 +103,7 @@ def form_groups(
 
     `tables` are the local instances of each chunk, in one frame of reference; `links` are of pairs of chunks, u <= v.
     The partition is the same in whatever order chunks and pairs are given: links are taken best first, ties by key. Two
-    groups are joined unless a cannot-link pair would come together, or too many pairs across speak against it (complete
+    groups are joined unless a cannot-link pair would come together, or too many pairs across contradict it (complete
     link), or the operator's `constraints` part them. What these link is joined afterwards, by `Constraints.joined`, so
     that each half of it goes on attracting what looks like it. Returns the groups, each sorted, ordered by their first
     member, and the decisions: one `merge` for each union, one `refuse` for each strong link that was not taken.

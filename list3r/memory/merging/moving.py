@@ -230,7 +230,7 @@ class _Scene:
         return placed.apply(motion.positions[nearest])
 
     def edge(self, x: _Node, y: _Node) -> tuple[float, dict[str, float], str] | None:
-        """Return what speaks for two nodes being one instance: (score, scores, reason)."""
+        """Return the evidence that two nodes are one instance: (score, scores, reason)."""
         best: tuple[float, dict[str, float], str] | None = None
         for a in x.keys:
             for b in y.keys:

@@ -42,7 +42,7 @@ class MergeSettings:
     """Diagonal up to which a view that the border does not cut is taken for whole; the far end of a larger instance is
     hidden or out of range."""
     max_conflicts: float = 0.25
-    """Share of the pairs across two clusters that may speak against joining them."""
+    """Share of the pairs across two clusters that may contradict joining them."""
     max_angle_deg: float = 10.0
     """Between the normals of two pieces of one plane."""
     most_span_m: float = 20.0

@@ -20,7 +20,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class VisibilitySettings:
-    """When depth speaks for a surface, and when for free space."""
+    """When depth is evidence for a surface, and when for free space."""
 
     tolerance_m: float = 0.025
     """How far a surface may lie from where it is stored: alignment of two sessions."""
@@ -103,14 +103,14 @@ def place_visibility(
 ) -> PlaceVisibility:
     """Ask frames about surface points of one instance, world coordinates, shape (N, 3)."""
     s = settings or VisibilitySettings()
-    told = []
+    verdicts = []
     for view in views:
-        there, free = _told(points, view, s)
+        there, free = _counts(points, view, s)
         if there + free >= max(s.least_points, s.least_share * len(points)):
-            told.append((there + free, free, (view.session_id, view.frame_index)))
-    if not told:
+            verdicts.append((there + free, free, (view.session_id, view.frame_index)))
+    if not verdicts:
         return PlaceVisibility("unseen", 0.0, ())
-    shares = np.array([f / n for n, f, _ in told])
+    shares = np.array([f / n for n, f, _ in verdicts])
     share = float(np.median(shares))
     gone = shares >= s.gone
     if share >= s.gone and gone.sum() >= s.least_frames:
@@ -118,8 +118,8 @@ def place_visibility(
     elif share <= s.there:
         verdict, kept = "there", shares <= s.there
     else:
-        verdict, kept = "unclear", np.ones(len(told), bool)
-    best = sorted((t for t, k in zip(told, kept, strict=True) if k), key=lambda t: (-t[0], t[2]))
+        verdict, kept = "unclear", np.ones(len(verdicts), bool)
+    best = sorted((t for t, k in zip(verdicts, kept, strict=True) if k), key=lambda t: (-t[0], t[2]))
     return PlaceVisibility(verdict, share, tuple(t[2] for t in best))
 
 
@@ -163,9 +163,9 @@ def tally(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> t
     """Return how many frames see through each point of a surface, and how many see it. Shapes (N,), (N,)."""
     free, met = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
-        told = point_visibility(points, view, s)
-        free += told == FREE
-        met += told == MET
+        seen = point_visibility(points, view, s)
+        free += seen == FREE
+        met += seen == MET
     return free, met
 
 
@@ -178,7 +178,7 @@ def seen_through_share(points: Array, views: Iterable[DepthView], s: VisibilityS
     return float(np.mean(free[known] > met[known])) if known.sum() >= s.least_points else None
 
 
-def _told(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
+def _counts(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
     """Return how many points of a surface one frame sees where they should be, and through how many it sees further."""
-    told = point_visibility(points, view, s)
-    return int((told == MET).sum()), int((told == FREE).sum())
+    seen = point_visibility(points, view, s)
+    return int((seen == MET).sum()), int((seen == FREE).sum())

@@ -21,7 +21,7 @@ class SupportSettings:
     around_m: float = 0.06
     """Width of the border round the footprint in which the height of the surface is measured,"""
     around_spacings: float = 2.0
-    """or so many spacings of its points."""
+    """or this many spacings of its points."""
     lowest: float = 0.01
     """Share of the lowest points that noise may misplace."""
     above: float = 0.6
@@ -32,13 +32,13 @@ class SupportSettings:
     """Confidence left where the surface is seen on one side only: what lies beside an instance on a table is as high as
     the table, but does not go round it."""
     sectors: int = 7
-    """Of eight directions, so many with a surface make it certain."""
+    """Of eight directions, this many with a surface make it certain."""
     hidden: float = 0.8
     """Confidence that an instance stands on feet that were not seen."""
     beneath_m: float = 0.05
     """A surface under the middle has points nearer to it than this, seen from above,"""
     beneath_spacings: float = 3.0
-    """or nearer than so many spacings."""
+    """or nearer than this many spacings."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ContainmentSettings:
     trim: float = 0.03
     """Share of the points at the ends of its height that noise may misplace."""
     side_noises: float = 2.5
-    """Sides are looked for above its lowest part by so many deviations of the noise,"""
+    """Sides are looked for above its lowest part by this many deviations of the noise,"""
     side_height: float = 0.3
     """or this share of its height, and as far above its top; the container has points below that much of its height."""
     clear: float = 0.25
@@ -91,9 +91,9 @@ class RelationSettings:
     computed_noise_m: float = 0.03
     """The same where depth was computed from colour: 2 % at 1.5 m, alike over an instance and other in each chunk."""
     contact_m: float = 0.035
-    """An instance may float or sink by this much and still stand on a surface: its lowest points are seldom seen."""
+    """An instance may float or sink by this much and still stand on a surface: its lowest points are rarely seen."""
     contact_per_height: float = 0.12
-    """More of it for tall instances, whose thin legs are seldom seen."""
+    """More of it for tall instances, whose thin legs are rarely seen."""
     hidden_feet: float = 0.6
     """An instance that stands on nothing and touches no wall stands on the floor if its lowest visible point is nearer
     to it than this share of its longest edge: legs under a table are often not seen."""

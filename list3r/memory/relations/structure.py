@@ -89,8 +89,8 @@ def classify_structure(
         rows = np.flatnonzero(gap <= s.near_m * unit).tolist()
         kind = _classify(b, floor_height, eye_level, np.concatenate([cloud[n] for n in rows]), unit, s)
         if kind == "floor" and b.flagged < s.least_flagged and floor_height is not None:
-            told = [known[n] for n in rows if known[n].flagged >= s.least_flagged]
-            floors = [n.points for n in told if _low(n, floor_height, unit, s)]
+            flagged = [known[n] for n in rows if known[n].flagged >= s.least_flagged]
+            floors = [n.points for n in flagged if _low(n, floor_height, unit, s)]
             kind = None if floors and _bordered(b.points, np.concatenate(floors), unit, s) else kind
         out.append(kind or flagged_only([b])[0])
     return out

@@ -77,7 +77,7 @@ def on_hidden_feet(scene: RelationScene, held: set[int]) -> list[Found]:
 
 def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
     """Return (clearance, position) of the instances wholly below a that have a surface under its middle and are wide
-    enough to bear it.
+    enough to hold it.
     """
     s, middle = scene.s.on, scene.instances[a].box.center[:2]
     bottom = float(np.quantile(scene.instances[a].points[:, 2], s.lowest))

@@ -36,7 +36,7 @@ _MOST_FILES = 16
 
 
 def cell_count(count: int) -> int:
-    """Return how many cells so many vectors fall into."""
+    """Return how many cells this many vectors fall into."""
     return int(_CELLS_BY_ROOT * np.sqrt(count))
 
 

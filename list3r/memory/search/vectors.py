@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import faiss
 
 _EXACT = 30_000
-"""Up to so many vectors all are compared; more are looked up in an inverted file."""
+"""Up to this many vectors all are compared; more are looked up in an inverted file."""
 _PROBED = 64
 """Cells looked into for a question, at least; twice as many whenever too few of what they hold passes the filters."""
 _LOOKED_AT = 10_000
@@ -25,7 +25,7 @@ _LOOKED_AT = 10_000
 _RANKED = 64
 """Candidates of the inverted file, at least, that are compared exactly with what the store holds."""
 _REBUILD = 0.1
-"""Share of the vectors that may have changed before the index is built anew."""
+"""Share of the vectors that may have changed before the index is built again."""
 
 
 class VectorIndices:
@@ -43,7 +43,7 @@ class VectorIndex:
 
     Small memories are compared in full. Large ones keep half-precision copies in an inverted file, and the best of
     those are compared again with the vectors in the store, so scores are exact at any size. What the store has changed
-    since the index was built is compared in full, too; what another process changed makes it be built anew.
+    since the index was built is compared in full, too; what another process changed makes it be built again.
     """
 
     space: str
@@ -79,7 +79,7 @@ class VectorIndex:
         return found
 
     def _caught_up(self, store: Store, stamp: tuple[int, int, bool]) -> bool:
-        """Take in what the store has changed since; False when that is so much that building anew is better."""
+        """Take in what the store has changed since; False when that is so much that building again is better."""
         if stamp == self._stamp:
             return True
         changed = sorted(set(store.embeddings.touched[self._seen :]))

@@ -164,7 +164,7 @@ class Sums:
 
 
 def write_part(database: sqlite3.Connection, table: SummedTable, part: int) -> None:
-    """Sum one part of a table anew."""
+    """Sum one part of a table again."""
     clause, arguments = table.where(part)
     query = f"SELECT {', '.join(table.summed)} FROM {table.name} WHERE {clause} ORDER BY {', '.join(table.key)}"
     crcs = b"".join(row_crc(row) for row in database.execute(query, arguments))
@@ -176,7 +176,7 @@ def write_part(database: sqlite3.Connection, table: SummedTable, part: int) -> N
 
 
 def write_all(database: sqlite3.Connection) -> None:
-    """Sum every row anew: after a migration, or when a file is made of the sound rows of another."""
+    """Sum every row again: after a migration, or when a file is made of the sound rows of another."""
     database.execute("DELETE FROM sums")
     for table in summed_tables().values():
         parts = database.execute(f"SELECT DISTINCT {table.part_of(table.name)} FROM {table.name}").fetchall()

@@ -232,7 +232,7 @@ class Connection:
             follower.write()
 
     def _written_over(self) -> str | None:
-        """The first damage of what the transaction that runs writes over, which must not be signed anew."""
+        """The first damage of what the transaction that runs writes over, which must not be signed again."""
         if self._sums is None or self._committed is None:
             return None
         return next((str(bad) for bad in self._sums.damaged_before(self._committed())), None)

@@ -68,7 +68,7 @@ class Facts:
     replaces = Fact[tuple[int, ...] | None]("replaces", tuple[int, ...], None)
     """Of a new memory that takes the place of an old one: what tells that file from any other of its name."""
     label_classes = Fact[dict[str, list[str] | None] | None]("label classes", dict[str, list[str] | None], None)
-    """By source of votes, the classes that it knows, None for one that speaks of every class; None before any vote."""
+    """By source of votes, the classes that it knows, None for one that knows every class; None before any vote."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

@@ -97,20 +97,32 @@ def protect(database: sqlite3.Connection) -> None:
 
 def identified(path: Path, database: sqlite3.Connection) -> int:
     """The schema version of a memory. Raises `MemoryFileError` for what is none, is newer, or holds what none does."""
-    application = int(database.execute("PRAGMA application_id").fetchone()[0])
-    version = int(database.execute("PRAGMA user_version").fetchone()[0])
+    application, version = numbers(database)
+    if application != APPLICATION_ID and path.stat().st_size < _SMALLEST:
+        raise MemoryFileError(f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`")
+    check_numbers(path, application, version)
+    if version < 1:
+        raise MemoryFileError(f"{path} has schema version {version}, which never existed; the file is damaged")
+    check_schema(path, database, version)
+    return version
+
+
+def numbers(database: sqlite3.Connection) -> tuple[int, int]:
+    """Return the application id and the schema version of a file."""
+    application, version = (
+        int(database.execute(f"PRAGMA {name}").fetchone()[0]) for name in ("application_id", "user_version")
+    )
+    return application, version
+
+
+def check_numbers(path: Path, application: int, version: int) -> None:
+    """Raise `MemoryFileError` for a file of another program, or of a newer version of this one."""
     if application != APPLICATION_ID:
-        if path.stat().st_size < _SMALLEST:
-            raise MemoryFileError(f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`")
         raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory")
     if version > SCHEMA_VERSION:
         raise MemoryFileError(
             f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
         )
-    if version < 1:
-        raise MemoryFileError(f"{path} has schema version {version}, which never existed; the file is damaged")
-    check_schema(path, database, version)
-    return version
 
 
 def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None:
@@ -127,7 +139,7 @@ def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None
 
 
 def write_empty(path: Path) -> None:
-    """Write a memory without rows, whole and on the disk before it bears its name. Raises `MemoryFileError`."""
+    """Write a memory without rows, whole and on the disk before it gets its name. Raises `MemoryFileError`."""
     new: Path | None = None
     try:
         descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-new-", dir=path.parent)
@@ -159,7 +171,7 @@ def taken(path: Path) -> str:
 
 
 def rename_exclusively(old: Path, new: Path) -> None:
-    """Give a file a name that nothing bears. Raises `FileExistsError`; without hard links the name is looked up."""
+    """Give a file a name that no file has. Raises `FileExistsError`; without hard links the name is looked up."""
     try:
         os.link(old, new, follow_symlinks=False)
     except FileExistsError:

@@ -55,7 +55,7 @@ class WriterLock:
                 os.close(descriptor)
                 raise MemoryFileError(f"{memory} is being written by {holder}; wait for it to end") from error
             if _is_current(descriptor, self._path):
-                return descriptor, made or _told(descriptor) is not None
+                return descriptor, made or _read_holder(descriptor) is not None
             os.close(descriptor)
 
     def _opened(self, memory: Path) -> tuple[int, bool]:
@@ -98,7 +98,7 @@ def _let_go(descriptor: int, path: Path, process: int, ours: bool) -> None:
 
 
 def _is_current(descriptor: int, path: Path) -> bool:
-    """Whether the file that was locked is still the one that bears the name: the last holder removes it."""
+    """Whether the file that was locked is still the one that has the name: the last holder removes it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.lstat())
     except OSError:
@@ -110,10 +110,10 @@ def _is_lock(descriptor: int) -> bool:
     found = os.fstat(descriptor)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1 or found.st_size > _MOST_BYTES:
         return False
-    return found.st_size == 0 or _told(descriptor) is not None
+    return found.st_size == 0 or _read_holder(descriptor) is not None
 
 
-def _told(descriptor: int) -> dict[str, Any] | None:
+def _read_holder(descriptor: int) -> dict[str, Any] | None:
     """What a lock says of its holder; None where it is no lock."""
     try:
         held = json.loads(os.pread(descriptor, _MOST_BYTES, 0))
@@ -140,7 +140,7 @@ def _me() -> dict[str, object]:
 
 def _holder(descriptor: int) -> str:
     """The holder of a lock in words."""
-    held = _told(descriptor)
+    held = _read_holder(descriptor)
     if held is None:
         return "another process"
     if held["pid"] == os.getpid() and held["host"] == socket.gethostname():

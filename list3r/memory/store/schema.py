@@ -119,7 +119,7 @@ MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE bends (chunk_id INTEGER PRIMARY KEY REFERENCES chunks, frames BLOB NOT NULL, twists BLOB NOT NULL);
     """,
-    # 6: which instances bear a word, and how well it names them, in hundredths; the vectors of one space without others
+    # 6: which instances have a word, and how well it names them, in hundredths; the vectors of one space without others
     """
     CREATE TABLE words (
         word TEXT NOT NULL, instance INTEGER NOT NULL REFERENCES instances, weight INTEGER NOT NULL,
@@ -187,11 +187,11 @@ MIGRATIONS: tuple[str, ...] = (
         instance INTEGER PRIMARY KEY REFERENCES instances, shape TEXT NOT NULL, resting INTEGER NOT NULL,
         swatches BLOB NOT NULL);
     """,
-    # 10: what is too seldom one thing to be listed
+    # 10: what is too unlikely to be one thing to be listed
     """
     ALTER TABLE local_instances ADD COLUMN scrap INTEGER NOT NULL DEFAULT 0;
     """,
-    # 11: how far chunks were carried since the library was derived; the floor is told where it is seen
+    # 11: how far chunks were carried since the library was derived; the floor is found where it is seen
     """
     ALTER TABLE settled ADD COLUMN carried BLOB NOT NULL
         DEFAULT X'0000000000000000000000000000000000000000000000000000000000000000';

@@ -34,7 +34,7 @@ from list3r.memory.store.tables.words import Words
 
 
 class Store:
-    """The memory file: `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` anew.
+    """The memory file: `Store.open(path)` to read, `writable=True` to write, `Store.create(path)` for a new one.
 
     What it holds is asked for and written by one object for each table (`store.chunks.all()`). What writes is called
     inside `transaction()`.

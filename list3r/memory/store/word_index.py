@@ -1,6 +1,6 @@
-"""Which instances bear a word: a table that follows the instances as a transaction commits, like their checksums.
+"""Which instances have a word: a table that follows the instances as a transaction commits, like their checksums.
 
-It is derived: `verify` compares it with the instances, `repair` makes it anew, and so does a program whose words are
+It is derived: `verify` compares it with the instances, `repair` makes it again, and so does a program whose words are
 others than those it was made with (`words.VERSION`), when it opens the file for writing.
 """
 
@@ -72,7 +72,7 @@ class WordIndex:
 
 
 def write_words(database: sqlite3.Connection) -> None:
-    """Make the whole table anew; inside a transaction."""
+    """Make the whole table again; inside a transaction."""
     database.execute("DELETE FROM words")
     database.execute("INSERT INTO words VALUES (?, ?, ?)", STAMP)
     expected = expected_words(database)

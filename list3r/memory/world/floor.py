@@ -1,4 +1,4 @@
-"""The floor, told where it is seen: a long walk climbs, and what is placed drifts."""
+"""The floor, found where it is seen: a long walk climbs, and what is placed drifts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def floor_near(
 ) -> float | None:
     """Return the height of the floor by the instances of one place; z must be up.
 
-    It is told as that of a whole memory is (`gravity.floor_height`), of what lies near and of the cameras that saw it,
+    It is found as that of a whole memory is (`gravity.floor_height`), of what lies near and of the cameras that saw it,
     (F, 3), so that it holds however the place lies to others. None where no floor was seen there.
     """
     flat = [b for b in near if b.normal is not None]

@@ -121,9 +121,9 @@ def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
     """Return what a unit of the graph is: by the chunks that are metric, else by the last anchor that stands."""
     inside = _main_part(chunks)
     metric = [c.chunk_id for c in inside if c.scale_kind == "metric"]
-    said = store.facts.scale_source
+    source = store.facts.scale_source
     if inside and len(metric) == len(inside):
-        return WorldScale("metric", None if said not in (None, "none") else "the reconstruction model", None)
+        return WorldScale("metric", None if source not in (None, "none") else "the reconstruction model", None)
     if metric:
         mean = float(np.mean([math.log(float(S_graph_chunk[k].scale)) for k in metric]))
         return WorldScale("metric", f"{len(metric)} of {len(inside)} chunks are metric", math.exp(-mean))
@@ -139,7 +139,7 @@ def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
 def rescale(store: Store) -> None:
     """Scale the world by the anchors that stand now; nothing where they say what they said before.
 
-    Writes where chunks lie; the library is to be derived anew then.
+    Writes where chunks lie; the library is to be derived again then.
     """
     chunks = store.chunks.all()
     S_world_graph = store.facts.S_world_graph

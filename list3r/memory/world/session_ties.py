@@ -63,7 +63,7 @@ class SessionTies:
         return np.asarray(np.linalg.inv(np.sum(information, axis=0))) if information else np.zeros((3, 3))
 
     def shifts(self, session: int, at: Array, deviations: float, known: float) -> list[Array]:
-        """Return by how much a session may be off at a place: so many deviations each way along the axes of its
+        """Return by how much a session may be off at a place: this many deviations each way along the axes of its
         covariance, less what is `known` to be left open anyway, world units. Shape (3,) each."""
         squares, axes = np.linalg.eigh(self.covariance(session, at))
         reach = deviations * np.sqrt(np.maximum(squares, 0.0)) - known

@@ -19,7 +19,7 @@ from list3r.association.overlap.motion import flag_moving
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunking.borrowing import Borrowed, Repeat, borrow, frames_around
 from list3r.frames.chunking.chunks import ChunkSpan
-from list3r.frames.later import read_some
+from list3r.frames.deferred import read_some
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library

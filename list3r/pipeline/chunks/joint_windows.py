@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeAlias
 
-from list3r.association.revisits.joint_rgbd import RgbdJointReconstructor
+from list3r.association.revisits.joint_source import JointSourceReconstructor
 from list3r.association.revisits.joint_window import JointReconstructor
 from list3r.memory.records import ChunkResult, JointWindow
 from list3r.memory.store.store import Store
@@ -44,7 +44,7 @@ class WindowTask:
 def joint_windows(store: Store, session: int, chunk: ChunkTask, pool: ChunkPool) -> JointReconstructor:
     """What makes joint windows for a session: here, or where its chunks are made if that takes a network."""
     if find_card(chunk.settings.reconstruction, "geometry") is None:
-        return RgbdJointReconstructor(_paths(store), {session: chunk.options}, joint_model(chunk))
+        return JointSourceReconstructor(_paths(store), {session: chunk.options}, joint_model(chunk))
 
     def ask(u_session: int, u_frames: Sequence[int], v_session: int, v_frames: Sequence[int]) -> JointWindow | None:
         sources = tuple(_paths(store).items())
@@ -61,8 +61,8 @@ def make_window(task: WindowTask) -> JointWindow | None:
 
 
 @lru_cache(maxsize=1)
-def _reconstructor(chunk: ChunkTask, session: int, sources: tuple[tuple[int, str], ...]) -> RgbdJointReconstructor:
-    return RgbdJointReconstructor(dict(sources), {session: chunk.options}, joint_model(chunk))
+def _reconstructor(chunk: ChunkTask, session: int, sources: tuple[tuple[int, str], ...]) -> JointSourceReconstructor:
+    return JointSourceReconstructor(dict(sources), {session: chunk.options}, joint_model(chunk))
 
 
 def _paths(store: Store) -> dict[int, str]:

@@ -22,7 +22,7 @@ class RayCluster:
             ray: Any = importlib.import_module("ray")
         except ModuleNotFoundError:
             raise MissingPackageError(
-                "--engine ray takes ray, which is not installed: pip install 'list3r[ray]'"
+                "--engine ray needs ray, which is not installed: pip install 'list3r[ray]'"
             ) from None
         self._ray = ray
         self.errors: Any = ray.exceptions

@@ -75,7 +75,7 @@ class RayPool(Generic[Task, Result]):
             raise
         except errors.RayError as error:
             said = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-            raise WorkerError(f"a chunk was lost on the Ray cluster ({said}); go on with --resume") from error
+            raise WorkerError(f"a chunk was lost on the Ray cluster ({said}); continue with --resume") from error
         finally:
             self._open.remove(reference)
 

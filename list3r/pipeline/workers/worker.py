@@ -80,10 +80,10 @@ class Worker:
     def _ended(self) -> WorkerError:
         status = self._process.wait()
         if status >= 0:
-            return WorkerError(f"a worker process ended with status {status}; what it said stands above")
+            return WorkerError(f"a worker process ended with status {status}; its output is above")
         return WorkerError(
-            f"a worker process was ended from outside (signal {-status}), most likely for want of memory; "
-            "go on with --resume and fewer --workers"
+            f"a worker process was ended from outside (signal {-status}), probably because memory ran out; "
+            "continue with --resume and fewer --workers"
         )
 
 

@@ -97,7 +97,7 @@ class Phrase:
 class Clause:
     """A relation to something."""
 
-    said: str
+    wording: str
     predicates: tuple[str, ...]
     object: Phrase
     other: Phrase | None = None
@@ -133,7 +133,7 @@ def _sentence(tokens: list[str], text: str) -> Phrase:
 
 def _clause(tokens: list[str], text: str) -> Clause:
     length, predicates = _relation_at(tokens, 0)
-    said, rest = " ".join(tokens[:length]), tokens[length:]
+    words, rest = " ".join(tokens[:length]), tokens[length:]
     if predicates == ("between",):
         if "and" not in rest:
             raise OptionError(f"{text!r}: between needs two things, as in: between 4 and the sofa")
@@ -143,9 +143,9 @@ def _clause(tokens: list[str], text: str) -> Clause:
         one, two = rest, []
     for part in (one, *([two] if predicates == ("between",) else [])):
         if not [t for t in part if t not in _FILLERS]:
-            raise OptionError(f"{text!r}: say what it should be {said}, as in: mug {said} table")
+            raise OptionError(f"{text!r}: say what it should be {words}, as in: mug {words} table")
     other = _sentence(two, text) if two else None
-    return Clause(said, predicates, _sentence(one, text), other)
+    return Clause(words, predicates, _sentence(one, text), other)
 
 
 def _phrase(tokens: list[str]) -> Phrase:
@@ -162,18 +162,18 @@ def _phrase(tokens: list[str]) -> Phrase:
                 size = word
             elif word not in GENERIC:
                 words.append(word)
-    said = " ".join(t for t in tokens if t not in _FILLERS)
-    return Phrase(said or "anything", tuple(dict.fromkeys(words)), size, superlative, number)
+    rest = " ".join(t for t in tokens if t not in _FILLERS)
+    return Phrase(rest or "anything", tuple(dict.fromkeys(words)), size, superlative, number)
 
 
 def _relation_at(tokens: list[str], k: int) -> tuple[int, tuple[str, ...]]:
     """Return (how many words, predicates) of the longest relation that begins at a word; 0 words for none."""
     for length in range(min(_LONGEST, len(tokens) - k), 0, -1):
-        said = tuple(tokens[k : k + length])
-        if said in _PHRASES:
-            return length, _PHRASES[said]
-        without = tuple(t for t in said if t != "the")
-        if length > 1 and without != said and without in _PHRASES and said[0] != "the" and said[-1] != "the":
+        words = tuple(tokens[k : k + length])
+        if words in _PHRASES:
+            return length, _PHRASES[words]
+        without = tuple(t for t in words if t != "the")
+        if length > 1 and without != words and without in _PHRASES and words[0] != "the" and words[-1] != "the":
             return length, _PHRASES[without]
     return 0, ()
 

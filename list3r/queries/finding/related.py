@@ -21,7 +21,7 @@ from list3r.queries.views.viewpoint import VIEWPOINT, between
 _BY_STRUCTURE_M = 0.4
 """Largest distance from a wall at which something is near it, metres: the memory stores `near` for things only."""
 _MOST_OBJECTS = 40
-"""Instances that others may be left of, or between: at most so many are considered."""
+"""Instances that others may be left of, or between: at most this many are considered."""
 _Pair = tuple[int, str, float, str]
 """Subject, predicate, confidence, and where it is seen from, in words."""
 
@@ -66,7 +66,7 @@ def related(
         out = _standing(search, found, objects, clause.predicates)
     if not out and objects and (others or not clause.other):
         what = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
-        search.notes.append(f"of {len(found)} instances that match {text!r} none is known to be {clause.said} {what!r}")
+        search.notes.append(f"{len(found)} instances match {text!r}, but none is known to be {clause.wording} {what!r}")
     return out
 
 
@@ -76,7 +76,7 @@ def _few(search: PhraseSearch, objects: list[PhraseMatch], clause: Clause) -> li
     if stored or len(objects) <= _MOST_OBJECTS:
         return objects
     search.notes.append(
-        f"{len(objects)} instances match the phrase after {clause.said!r}; the best {_MOST_OBJECTS} were considered"
+        f"{len(objects)} instances match the phrase after {clause.wording!r}; the best {_MOST_OBJECTS} were considered"
     )
     return sorted(objects, key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))[:_MOST_OBJECTS]
 
@@ -89,12 +89,12 @@ def _standing(
     together = _pairs_of_many(search, subjects, objects, predicates) if len(objects) > _MOST_OBJECTS else None
     for object in objects:
         pairs = _pairs(search, subjects, object, predicates) if together is None else together[object.instance.id]
-        for subject, predicate, confidence, whence in pairs:
+        for subject, predicate, confidence, via in pairs:
             c = subjects[subject]
             score = c.score * confidence * (0.5 + 0.5 * object.score)
             if subject not in best or score > best[subject].score:
                 o = object.instance
-                why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{whence})"
+                why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{via})"
                 inner = tuple(r for r in object.reasons if not r.startswith(("named", "#")))
                 best[subject] = PhraseMatch(c.instance, score, (*c.reasons, why, *inner))
     return [best[n] for n in sorted(best)]
@@ -141,8 +141,8 @@ def _pairs(
         held = relations(search.store, None, predicate, o.id, viewpoint=place)
         if held.state == "unknown" and (predicate in VIEWPOINT or predicate in VERTICAL):
             search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
-        whence = f", {held.reason.split(';')[0]}" if place is not None else ""
-        out += [(r.subject, r.predicate, r.confidence, whence) for r in held if r.subject in subjects]
+        via = f", {held.reason.split(';')[0]}" if place is not None else ""
+        out += [(r.subject, r.predicate, r.confidence, via) for r in held if r.subject in subjects]
     if "near" in predicates and (o.structure is not None):
         out += _near_structure(search, subjects, o)
     return [p for p in out if p[0] != o.id]

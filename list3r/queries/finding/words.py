@@ -23,12 +23,12 @@ def wanted_words(text: str) -> list[str]:
 
 
 def is_named(instance: Instance, text: str) -> bool:
-    """Tell whether label, kind of structure and description together bear all the words."""
+    """Tell whether label, kind of structure and description together have all the words."""
     return set(wanted_words(text)) <= words_of(instance)
 
 
 def is_colored(instance: Instance, text: str) -> bool:
-    """Tell whether the main colour bears all the words: "red" is said of what is dark red, not the other way round."""
+    """Tell whether the main colour has all the words: "red" is said of what is dark red, not the other way round."""
     return set(wanted_words(text)) <= set(split_words(instance.color_name))
 
 
@@ -43,11 +43,11 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
     """Return (score in [0, 1], words found): how well each word names it as `vocabulary` has it, the beginning of a
     word half as well.
     """
-    borne = vocabulary(instance.label, instance.structure, instance.description, instance.color_name)
+    weights = vocabulary(instance.label, instance.structure, instance.description, instance.color_name)
     total, hit = 0.0, []
     for word in wanted:
-        begun = (0.5 * weight for said, weight in borne.items() if len(word) >= 3 and said.startswith(word))
-        best = borne.get(word) or max(begun, default=0.0)
+        begun = (0.5 * value for known, value in weights.items() if len(word) >= 3 and known.startswith(word))
+        best = weights.get(word) or max(begun, default=0.0)
         if best > 0.0:
             hit.append(word)
         total += best
@@ -56,8 +56,8 @@ def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]
 
 def no_such_words(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:
     """Say that no instance has some words, and what most things are called (the last words of names)."""
-    said = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
-    count = Counter(word for last in said for word in last)
+    last_words = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
+    count = Counter(word for last in last_words for word in last)
     names = ", ".join(word for word, _ in sorted(count.items(), key=lambda c: (-c[1], c[0]))[:most])
     missing = f"word{'s' if len(words) > 1 else ''} {', '.join(map(repr, words))}"
     return f"no instance has the {missing} in its label or description" + (

@@ -108,9 +108,8 @@ def last_camera(store: Store, session: int | None = None) -> PosedCamera:
 
 
 def _checked_session(store: Store, session: int | None) -> int | None:
-    known = [s.session_id for s in store.sessions.all()]
-    if session is not None and session not in known:
-        raise OptionError(f"{store.path} has no session {session}; it has: {', '.join(map(str, known)) or 'none'}")
+    if session is not None:
+        store.sessions.check(session)
     return session
 
 

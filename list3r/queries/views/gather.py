@@ -20,7 +20,7 @@ from list3r.queries.match import checked_instance
 from list3r.queries.views.viewpoint import VIEWPOINT
 
 EVERYTHING = 5_000
-"""Up to so many instances all are loaded."""
+"""Up to this many instances all are loaded."""
 _MOST_BEARING = 300_000
 """Ids that have the words of one phrase, at most."""
 _MOST = 5_000
@@ -47,11 +47,11 @@ class Gathered:
         return self.store.ids.sample(_SAMPLE)
 
     def bearing(self, words: tuple[str, ...]) -> list[int]:
-        """Return ids that bear all of some words, the best first."""
+        """Return ids that have all of some words, the best first."""
         return [n for n, _ in self._named(words)]
 
     def named(self, words: tuple[str, ...]) -> list[tuple[int, int]]:
-        """Return the ids that are looked at of those that bear all of some words, with how well these name them."""
+        """Return the ids that are looked at of those that have all of some words, with how well these name them."""
         found = self._named(words)
         if len(found) > _MOST:
             self.notes.append(f"{len(found)} instances match {' '.join(words)!r}; {_MOST} of them were considered")
@@ -66,7 +66,7 @@ class Gathered:
         return self._bearing[words]
 
     def sizes_of(self, words: tuple[str, ...]) -> NDArray[np.float64]:
-        """Return longest edges of some of things that bear some words, of any where fewer than four do; ascending."""
+        """Return longest edges of some of things that have some words, of any where fewer than four do; ascending."""
         bearing = self.bearing(words) if words else []
         ids = bearing[:: -(-len(bearing) // _SAMPLE)] if len(bearing) >= 4 else self.sample
         edges = [float(np.max(i.box.size)) for i in self.store.instances.of(ids) if i.structure is None]

@@ -27,7 +27,7 @@ _MAX_REACH = 40
 _BY_CELLS = 6
 """Points that reach further, few and near, are drawn one by one."""
 _FEW = 9
-"""With fewer points than this the box stands for the surface, so many points along each edge."""
+"""With fewer points than this the box stands for the surface, this many points along each edge."""
 _MANY = 5_000
 """In memories of more things than this those that would hardly show are not looked at."""
 _LEAST_CELLS = 2.0

@@ -40,7 +40,7 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
     # The inner network: the outer one chooses half precision by asking CUDA, which a CPU has not got.
     output = model.model(normalised(pictures)[None], export_feat_layers=[])
     if "extrinsics" not in output or "depth_conf" not in output:
-        raise OptionError("these weights of da3 say nothing of cameras; give any-view weights, such as DA3-BASE")
+        raise OptionError("these weights of da3 do not predict cameras; give any-view weights, such as DA3-BASE")
     shape = (len(pictures), *pictures.shape[-2:])
     K_found = numpy(output["intrinsics"][0]).astype(np.float64)
     return WindowOutput(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.frames.later import LazyFrame
+from list3r.frames.deferred import LazyFrame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
 from list3r.reconstruction.motion.movers import Mask, MoverMemory, find_mover, fit, without
 from list3r.reconstruction.poses import angle_deg, shows_more

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import PosedOnly, Reconstruction
-from list3r.reconstruction.motion.follow import follow_movers
 from list3r.reconstruction.motion.moving import SmallFrames, find_moving
+from list3r.reconstruction.motion.moving_tracks import follow_movers
 from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.registry import ModelOptions

@@ -86,7 +86,7 @@ def _of_known(
     sigma = _focal_sigma(windows, settings)
     if abs(np.log(free.fx / start.fx)) > settings.doubted_sigmas * sigma:
         said = (
-            f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which say about "
+            f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which suggest about "
             f"{_told_px(free, sigma, stored_px)}; check --intrinsics, or leave it out"
         )
         return CameraCalibration(start, len(windows), free.fx, sigma, (said,))
@@ -169,8 +169,9 @@ def _parted(found: _Estimate, stored_px: float, settings: CameraCalibrationSetti
         return ()
     where = ", ".join(f"{f * stored_px:.0f} px from frame {n} on" for n, f in far)
     return (
-        f"parts of the video say another focal length ({where}): the camera zoomed or changed its lens, or they tell "
-        "too little; one camera is taken for all. Build what one lens took by itself (--frames, or --start and --end)",
+        f"parts of the video suggest another focal length ({where}): the camera zoomed or changed its lens, or they "
+        "show too little; one camera is used for all. Build the part of each lens separately (--frames, or --start and "
+        "--end)",
     )
 
 

@@ -156,7 +156,7 @@ class _Candidates:
         return Sim3(scale, R, middle_v - scale[:, None] * np.einsum("hij,hj->hi", R, middle_u))
 
     def scores(self, S: Sim3) -> Array:
-        """Return how much speaks for each similarity: no thing counts twice on either side. Shape (H,)."""
+        """Return the evidence for each similarity: no thing counts twice on either side. Shape (H,)."""
         gain = self._gain(S)
         of_u = np.maximum.reduceat(gain, self._first, axis=1).sum(axis=1)
         of_v = np.maximum.reduceat(gain[:, self._by_v], self._first_v, axis=1).sum(axis=1)

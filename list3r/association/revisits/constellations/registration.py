@@ -1,6 +1,6 @@
 """Register two chunks by their things alone, and say whether to believe it.
 
-What things match is found by `matching`, where exactly by `surface_fit`; a relation is believed by what speaks for it
+What things match is found by `matching`, where exactly by `surface_fit`; a relation is accepted by the evidence for it
 together: how many things agree and how well, that no other place fits nearly as well, how much of the surfaces meets
 and that neither chunk sees through what the other saw. The weights were chosen on simulated homes
 (docs/decisions/0053).
@@ -67,7 +67,7 @@ class ConstellationRegistrationSettings:
     tried: int = 3
     """Most hypotheses that surfaces judge,"""
     least_pairs: int = 4
-    """of those with so many things,"""
+    """of those with this many things,"""
     least_match: float = 5.0
     """whose log odds sum up to this."""
     believed_pairs: int = 4
@@ -160,7 +160,7 @@ def refusal(scores: Mapping[str, float], settings: ConstellationRegistrationSett
     if scores["agreeing"] < settings.believed_pairs:
         return f"with surfaces brought together only {scores['agreeing']:.0f} of them do"
     if (odds := log_odds(scores, settings.belief)) < settings.least_belief:
-        return f"too little speaks for it (log odds {odds:.1f}, wanted {settings.least_belief:.1f})"
+        return f"too little evidence for it (log odds {odds:.1f}, wanted {settings.least_belief:.1f})"
     if scores["fitting"] < settings.least_fitting:
         return f"too little of the surfaces meets ({scores['fitting']:.0%})"
     if scores["rival"] > settings.most_rival:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.revisits.chain import Ways
+from list3r.association.revisits.chain import EdgeChains
 from list3r.association.revisits.constellations.constellation import (
     Constellation,
     make_constellation,
@@ -92,7 +92,9 @@ class ThingSearch:
         self._neighbours = _neighbours_in_time(store.edges.all(), chunk_id)
         self._here: dict[int, Sim3] = self._members(chunk_id, {})
 
-    def edges(self, apart: Sequence[int], tied: Sequence[int], ways: Ways, most_deviations: float) -> list[Edge]:
+    def edges(
+        self, apart: Sequence[int], tied: Sequence[int], chains: EdgeChains, most_deviations: float
+    ) -> list[Edge]:
         """Return loop edges, accepted or rejected, to the chunks that are worth it."""
         s = self._settings
         pick = np.linspace(0, len(apart) - 1, min(len(apart), s.most_apart)).astype(np.int64)
@@ -119,27 +121,27 @@ class ThingSearch:
             old = self._place(members.setdefault(u, self._members(u, self._here)))
             found = register(old, new, self._metric(u), s.registration)
             if found is not None:
-                way = ways.predict(u, self._id) if u in tied else None
-                off = None if way is None else way.deviations(found.S_v_u)
+                chain = chains.predict(u, self._id) if u in tied else None
+                off = None if chain is None else chain.deviations(found.S_v_u)
                 against = refusal(found.scores, s.registration)
                 if against is None and off is not None and off > most_deviations:
-                    against = f"the way between the chunks contradicts it by {off:.0f} deviations"
+                    against = f"the chain of edges between the chunks contradicts it by {off:.0f} deviations"
                 out.append(self._edge(u, old, new, found, against))
-        return [self._outdone(e, out, ways) for e in out]
+        return [self._outdone(e, out, chains) for e in out]
 
     def _places(self, likely: list[int], members: Mapping[int, Mapping[int, Sim3]], apart: Sequence[int]) -> list[int]:
         """Return the chunks whose surroundings are registered: the likely ones, then what surrounds the likeliest."""
         near = [n for u in likely for n in members[u] if n in apart and n not in likely]
         return list(dict.fromkeys([*likely[: self._settings.places], *near]))[: self._settings.registered]
 
-    def _outdone(self, edge: Edge, found: Sequence[Edge], ways: Ways) -> Edge:
-        """Return an edge, rejected where about as much speaks for one that names another place."""
+    def _outdone(self, edge: Edge, found: Sequence[Edge], chains: EdgeChains) -> Edge:
+        """Return an edge, rejected if there is about as much evidence for another place."""
         if not edge.accepted:
             return edge
         lead = float("inf")
         for other in found:
-            way = ways.predict(other.u, self._id, [edge]) if other is not edge else None
-            if way is not None and way.deviations(other.S_v_u) > self._settings.elsewhere:
+            chain = chains.predict(other.u, self._id, [edge]) if other is not edge else None
+            if chain is not None and chain.deviations(other.S_v_u) > self._settings.elsewhere:
                 lead = min(lead, edge.scores[_BELIEF] - other.scores[_BELIEF])
         if lead >= self._settings.least_lead:
             return edge
@@ -239,7 +241,7 @@ class ThingSearch:
             inliers=int(found.scores["pairs"]),
             residual_m=found.fit.residual * new.constellation.unit,
             accepted=against is None,
-            reason=f"{agree}; {against}" if against else f"{agree}, and surfaces with them",
+            reason=f"{agree}; {against}" if against else f"{agree}, and so do the surfaces",
             scores={f"things_{name}": value for name, value in found.scores.items()}
             | {_BELIEF: log_odds(found.scores, self._settings.registration.belief)},
             frames=(self._middle_keyframe(u), self._middle_keyframe(self._id)),

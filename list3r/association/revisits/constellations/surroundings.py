@@ -57,7 +57,7 @@ def gather(
 ) -> tuple[list[LocalNode], Side]:
     """Return the instances and the samples of several chunks in the frame of the first one.
 
-    Frames and local ids are numbered anew; things of two chunks that stand in one place are one. `space` is the
+    Frames and local ids are numbered again; things of two chunks that stand in one place are one. `space` is the
     embedding space of the features.
     """
     s = settings or SurroundingsSettings()

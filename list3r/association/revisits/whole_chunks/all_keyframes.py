@@ -1,8 +1,8 @@
 """Place a chunk of one session beside one of another by all keyframes of both, where much has changed in between.
 
 Few frames of a changed room in another light look alike, so every keyframe is compared with every other one. What was
-moved then speaks for wrong places, often with more keyframes than one; so relations that put the chunk at one place
-are taken together, and the whole of both chunks decides between the places (`witness`, docs/decisions/0134).
+moved then supports wrong places, often with more keyframes than one; so relations that put the chunk at one place
+are taken together, and the whole of both chunks decides between the places (`chunk_agreement`, docs/decisions/0134).
 """
 
 from __future__ import annotations
@@ -15,14 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.witness import ChunkKeyframes, Witness, WitnessSettings, witness
+from list3r.association.revisits.whole_chunks.chunk_agreement import (
+    ChunkAgreement,
+    ChunkAgreementSettings,
+    ChunkKeyframes,
+    chunk_agreement,
+)
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
 
 Array = NDArray[np.float64]
 
 WITNESSED = "witnessed"
-"""Score of a relation that the whole of both chunks speaks for: how much of what both saw agrees, in [0, 1]."""
+"""Score of a relation that the whole of both chunks supports: how much of what both saw agrees, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +45,14 @@ class AllKeyframesSettings:
     least_seen: float = 0.08
     """Share of either chunk's points that neither keyframe saw and the other chunk did."""
     least_agreement: float = 0.4
-    """Share of those that must lie on a surface of the other, whichever way they face (`Witness.agreement`)."""
+    """Share of those that must lie on a surface of the other, whichever way they face (`ChunkAgreement.agreement`)."""
     contradicted: float = 0.15
-    """With less of it a relation is contradicted, whatever else speaks for it."""
+    """With less of it a relation is contradicted, whatever else supports it."""
     margin: float = 0.15
     """By which another place must agree less."""
     kept: int = 6
     """Most relations of the place that is believed."""
-    witness: WitnessSettings = field(default_factory=WitnessSettings)
+    whole: ChunkAgreementSettings = field(default_factory=ChunkAgreementSettings)
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class _Place:
     """Relations that put a chunk at one place, the best one first, and what the whole of the chunks says of that."""
 
     edges: list[Edge]
-    witness: Witness
+    whole: ChunkAgreement
 
 
 def place_by_all_keyframes(
@@ -74,17 +79,17 @@ def place_by_all_keyframes(
     measured = [e for e in edges if e.S_v_u.translation.any()]
     if not any(e.accepted for e in measured):
         return []
-    views = ChunkKeyframes(old, s.witness), ChunkKeyframes(new, s.witness)
+    views = ChunkKeyframes(old, s.whole), ChunkKeyframes(new, s.whole)
     centers = np.array([k.T_chunk_cam[:3, 3] for k in old])
     places = [_asked(group, *views) for group in _by_place(measured, centers, s)]
-    likely = sorted((p for p in places if p.witness.seen >= s.least_seen), key=lambda p: -p.witness.agreement)
+    likely = sorted((p for p in places if p.whole.seen >= s.least_seen), key=lambda p: -p.whole.agreement)
     if not likely:
         return []
-    best = likely[0].witness.agreement
-    unsure = len(likely) > 1 and likely[1].witness.agreement > best - s.margin
+    best = likely[0].whole.agreement
+    unsure = len(likely) > 1 and likely[1].whole.agreement > best - s.margin
     if best < s.least_agreement or unsure:
         return []
-    return [_witnessed(e, likely[0].witness) for e in likely[0].edges if e.accepted][: s.kept]
+    return [_witnessed(e, likely[0].whole) for e in likely[0].edges if e.accepted][: s.kept]
 
 
 def contradicted(
@@ -94,8 +99,8 @@ def contradicted(
     s = settings or AllKeyframesSettings()
     if edge.frames is None:
         return False
-    views = ChunkKeyframes(old, s.witness), ChunkKeyframes(new, s.witness)
-    found = witness(edge.S_v_u.as_matrix(), *views, edge.frames)
+    views = ChunkKeyframes(old, s.whole), ChunkKeyframes(new, s.whole)
+    found = chunk_agreement(edge.S_v_u.as_matrix(), *views, edge.frames)
     return found.seen >= s.least_seen and found.agreement < s.contradicted
 
 
@@ -125,9 +130,9 @@ def _one_place(a: Sim3, b: Sim3, centers: Array, s: AllKeyframesSettings) -> boo
 def _asked(edges: list[Edge], u: ChunkKeyframes, v: ChunkKeyframes) -> _Place:
     best = edges[0]
     assert best.frames is not None
-    return _Place(edges, witness(best.S_v_u.as_matrix(), u, v, best.frames))
+    return _Place(edges, chunk_agreement(best.S_v_u.as_matrix(), u, v, best.frames))
 
 
-def _witnessed(edge: Edge, found: Witness) -> Edge:
-    said = f"{edge.reason}; of what else both chunks saw {found.agreement:.0%} agrees"
-    return replace(edge, scores=edge.scores | {WITNESSED: found.agreement}, reason=said)
+def _witnessed(edge: Edge, found: ChunkAgreement) -> Edge:
+    reason = f"{edge.reason}; of what else both chunks saw {found.agreement:.0%} agrees"
+    return replace(edge, scores=edge.scores | {WITNESSED: found.agreement}, reason=reason)

@@ -96,7 +96,7 @@ def _pincams(root: Path, times_s: NDArray[np.float64]) -> tuple[list[list[float]
 def _pincam(path: Path) -> list[float]:
     rows = read_numbers(path)
     if not rows or len(rows[0]) != 6:
-        raise SourceError(f"{path} is not `width height fx fy cx cy`; mend or remove it")
+        raise SourceError(f"{path} is not `width height fx fy cx cy`; fix or remove it")
     try:
         check_intrinsics(rows[0][2:])
     except OptionError as error:

@@ -82,10 +82,10 @@ def _camera(path: Path) -> tuple[list[float] | None, NDArray[np.float64] | None]
         return None, None
     content = read_json(path)
     if not isinstance(content, dict):
-        raise SourceError(f"{path} is not a camera of Polycam; mend or remove it")
+        raise SourceError(f"{path} is not a camera of Polycam; fix or remove it")
     try:
         stated = [float(content[name]) for name in ("fx", "fy", "cx", "cy", "width", "height")]
         T_world_arkit = pose_matrix(float(content[f"t_{row}{column}"]) for row in range(3) for column in range(4))
     except (KeyError, TypeError, ValueError):
-        raise SourceError(f"{path} lacks fx, fy, cx, cy, width, height or t_00 to t_23; mend or remove it") from None
+        raise SourceError(f"{path} lacks fx, fy, cx, cy, width, height or t_00 to t_23; fix or remove it") from None
     return stated, None if T_world_arkit is None else pose_of_arkit(T_world_arkit)

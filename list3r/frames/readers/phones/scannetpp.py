@@ -71,7 +71,7 @@ def _cameras(path: Path) -> tuple[dict[int, Intrinsics], dict[int, NDArray[np.fl
         found = {number: _pose(row) for number, row in rows.items()}
     except (KeyError, TypeError, ValueError, OptionError):
         raise SourceError(
-            f"{path}: a frame lacks intrinsic (3 x 3) or aligned_pose (4 x 4); mend or remove it"
+            f"{path}: a frame lacks intrinsic (3 x 3) or aligned_pose (4 x 4); fix or remove it"
         ) from None
     return stated, {number: T for number, T in found.items() if T is not None}
 
@@ -105,4 +105,4 @@ def _depth(path: Path) -> tuple[dict[int, CodedArray], float]:
         except (FrameError, zlib.error):
             continue
         return {k: CodedArray(s, codec, dtype, _SIZE) for k, s in enumerate(slices)}, units  # type: ignore[arg-type]
-    raise SourceError(f"{path} is packed in no known way (LZ4, deflate); was it copied whole?")
+    raise SourceError(f"{path} is packed in no known way (LZ4, deflate); is the copy complete?")

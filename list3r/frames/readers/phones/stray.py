@@ -61,7 +61,7 @@ def _matrix(path: Path) -> tuple[Intrinsics, str]:
         raise SourceError(f"{path} is missing; is the copy complete? --intrinsics fx,fy,cx,cy says the camera, too")
     rows = read_numbers(path)
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
-        raise SourceError(f"{path} is no 3x3 camera matrix; mend it, or give --intrinsics fx,fy,cx,cy")
+        raise SourceError(f"{path} is not a 3x3 camera matrix; fix it, or give --intrinsics fx,fy,cx,cy")
     note = "camera of camera_matrix.csv"
     if rows[0][2] == rows[1][2] == 0 and any(rows[2][:2]):
         rows, note = [list(row) for row in zip(*rows, strict=True)], f"{note} (written column by column)"
@@ -81,7 +81,7 @@ def _odometry(path: Path) -> dict[int, NDArray[np.float64]]:
         try:
             _, frame, *values = (float(word) for word in words[:9])
         except ValueError:
-            raise SourceError(f"{path}: line {number} is not timestamp, frame and a pose; mend or remove it") from None
+            raise SourceError(f"{path}: line {number} is not timestamp, frame and a pose; fix or remove it") from None
         T_world_cam = pose_of_quaternion(values[:3], values[3:7]) if _whole(frame) else None
         if T_world_cam is not None:
             poses[int(frame)] = np.asarray(Z_UP_FROM_Y_UP @ T_world_cam)

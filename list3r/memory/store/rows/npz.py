@@ -35,9 +35,9 @@ def write_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         data = _header(array.dtype.str, array.shape) + array.tobytes()
         packed = zlib.compress(data, _LEVEL, wbits=-zlib.MAX_WBITS)
         name = f"{key}.npy".encode()
-        told = _VERSION, 0, _DEFLATED, 0, _FIRST_DAY, zlib.crc32(data), len(packed), len(data), len(name), 0
-        parts += [_LOCAL.pack(_MARKS[0], *told), name, packed]
-        listing += [_CENTRAL.pack(_MARKS[1], _VERSION, *told, 0, 0, 0, 0, offset), name]
+        header = _VERSION, 0, _DEFLATED, 0, _FIRST_DAY, zlib.crc32(data), len(packed), len(data), len(name), 0
+        parts += [_LOCAL.pack(_MARKS[0], *header), name, packed]
+        listing += [_CENTRAL.pack(_MARKS[1], _VERSION, *header, 0, 0, 0, 0, offset), name]
         offset += _LOCAL.size + len(name) + len(packed)
     size = sum(map(len, listing))
     end = _END.pack(_MARKS[2], 0, 0, len(arrays), len(arrays), size, offset, 0)

@@ -328,8 +328,8 @@ def bad_values(database: sqlite3.Connection, name: str, where: str = "1", argume
     query = f"SELECT {', '.join(keys)} FROM {name} WHERE {where} AND NOT ({bad})"
     for key in database.execute(query, arguments).fetchall():
         here = " AND ".join(f"{k} IS ?" for k in keys)
-        told = database.execute(f"SELECT {', '.join(conditions.values())} FROM {name} WHERE {here}", key).fetchone()
-        wrong = [column for column, good in zip(conditions, told or (), strict=False) if not good]
+        verdict = database.execute(f"SELECT {', '.join(conditions.values())} FROM {name} WHERE {here}", key).fetchone()
+        wrong = [column for column, good in zip(conditions, verdict or (), strict=False) if not good]
         yield BadRow(name, key, f"{wrong[0]} is not {rules[wrong[0]].words}" if wrong else "its key is of another type")
 
 

@@ -188,8 +188,8 @@ class Chunks:
     def stage_seconds(self) -> dict[str, float]:
         """Return the CPU seconds spent so far by stage, over all chunks."""
         total: dict[str, float] = {}
-        for told in self._measured.values("seconds", "1"):
-            for stage, seconds in told.items():
+        for stages in self._measured.values("seconds", "1"):
+            for stage, seconds in stages.items():
                 total[stage] = total.get(stage, 0.0) + seconds
         return total
 

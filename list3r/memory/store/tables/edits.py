@@ -82,20 +82,20 @@ _FIELDS = ("kind", "parts", "through", "before", "text", "target", "scale")
 
 
 def _pack(kind: str, *values: object) -> tuple[str, str]:
-    told = dict(zip(_FIELDS[1:], map(plain, values), strict=True))
-    if told["scale"] is None:
-        del told["scale"]
-    return kind, to_json(told)
+    fields = dict(zip(_FIELDS[1:], map(plain, values), strict=True))
+    if fields["scale"] is None:
+        del fields["scale"]
+    return kind, to_json(fields)
 
 
 def _unpack(kind: str, arguments: str) -> tuple[object, ...]:
-    told = parse_json(arguments)
-    parts = tuple(_keys(part) for part in told["parts"])
+    fields = parse_json(arguments)
+    parts = tuple(_keys(part) for part in fields["parts"])
     if kind not in EDIT_KINDS or (kind in ("merge", "split") and len(parts) != 2):
         raise ValueError(f"{kind} of {len(parts)} parts")
-    before = tuple((int(n), label, _keys(keys)) for n, label, keys in told["before"])
-    scale = None if told.get("scale") is None else (int(told["scale"][0]), float(told["scale"][1]))
-    return kind, parts, int(told["through"]), before, told["text"], told["target"], scale
+    before = tuple((int(n), label, _keys(keys)) for n, label, keys in fields["before"])
+    scale = None if fields.get("scale") is None else (int(fields["scale"][0]), float(fields["scale"][1]))
+    return kind, parts, int(fields["through"]), before, fields["text"], fields["target"], scale
 
 
 def _keys(pairs: Any) -> tuple[Key, ...]:

@@ -11,7 +11,7 @@ from list3r.memory.store.rows.table import Table
 
 
 class Events:
-    """The table of events, which are derived: they are written anew whenever the library is."""
+    """The table of events, which are derived: they are written again whenever the library is."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

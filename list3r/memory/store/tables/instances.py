@@ -187,7 +187,7 @@ class Instances:
         return _bounds(rows[0][0]) if rows and len(rows[0][0]) >= 4 else None
 
     def index_boxes(self) -> None:
-        """Fill the R*Tree anew from the instances."""
+        """Fill the R*Tree again from the instances."""
         rows = self._connection.rows("SELECT id, geometry FROM instances ORDER BY id")
         self._connection.execute("DELETE FROM instance_boxes")
         self._put_boxes((n, np.frombuffer(g, "<f8")[3:9].reshape(2, 3)) for n, g in rows)

@@ -46,7 +46,7 @@ class _OfChunk:
 
 @dataclass(frozen=True)
 class Anchor:
-    """The chunk that an instance hangs on."""
+    """The chunk that an instance is attached to."""
 
     chunk_id: int
     S_exact_settled: Sim3
@@ -108,7 +108,7 @@ class Settled:
         return self._known
 
     def put(self, rows: Mapping[int, SettledRow]) -> None:
-        """Settle chunks, or settle them anew; which of their points were dropped is forgotten."""
+        """Settle chunks, or settle them again; which of their points were dropped is forgotten."""
         known = {**self.all(), **rows}
         self._rows.put((_OfChunk(k, row) for k, row in rows.items()), dropped=b"")
         self._known = dict(sorted(known.items()))
@@ -123,7 +123,7 @@ class Settled:
         self._known = dict(sorted(known.items()))
 
     def rest(self) -> None:
-        """Forget how far chunks were carried, for all is derived anew where they lie."""
+        """Forget how far chunks were carried, for all is derived again where they lie."""
         self.carry({k: replace(row, carried=np.zeros(4)) for k, row in self.all().items() if row.carried.any()})
 
     def drop(self, chunk_id: int) -> None:
@@ -311,13 +311,13 @@ class _AnchorRow:
 
 
 class Anchors:
-    """The table of which chunks instances hang on. What writes is called inside `transaction()`."""
+    """The table of which chunks instances are attached to. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
         self._rows = Table(connection, "anchors", Columns.of(_AnchorRow), "instance")
 
     def put(self, anchors: Mapping[int, Anchor]) -> None:
-        """Say which chunk instances hang on, by id."""
+        """Record which chunk instances are attached to, by id."""
         self._rows.put(_AnchorRow(n, a.chunk_id, a.S_exact_settled) for n, a in anchors.items())
 
     def all(self, ids: Sequence[int] | None = None) -> dict[int, Anchor]:
@@ -326,7 +326,7 @@ class Anchors:
         return {row.instance: Anchor(row.chunk_id, row.S_exact_settled) for row in rows}
 
     def drop(self, instance_id: int) -> None:
-        """Forget which chunk an instance hangs on."""
+        """Forget which chunk an instance is attached to."""
         self._rows.delete("instance = ?", (instance_id,))
 
 
@@ -378,16 +378,16 @@ class LibraryState:
         self.redundant = Redundant(connection)
         self.looks = LooksTable(connection)
         self.touched: set[int] | None = None
-        """Chunks that were placed or measured anew since the library was derived; None where that is not known."""
+        """Chunks that were placed or measured again since the library was derived; None where that is not known."""
         connection.on_forget(self._forget)
 
     def touch(self, chunk_ids: Iterable[int]) -> None:
-        """Note that chunks were placed or measured anew."""
+        """Note that chunks were placed or measured again."""
         if self.touched is not None:
             self.touched.update(chunk_ids)
 
     def unsettle(self, chunk_id: int) -> None:
-        """Note that what was derived from a chunk does not hold any more: it was measured anew."""
+        """Note that what was derived from a chunk does not hold any more: it was measured again."""
         self.settled.drop(chunk_id)
         self.touch([chunk_id])
 

@@ -25,7 +25,7 @@ class Observations:
         self._rows.put(observations)
 
     def clear(self) -> None:
-        """Forget which instance each local instance belongs to, before all of it is said anew."""
+        """Forget which instance each local instance belongs to, before all of it is said again."""
         self._rows.delete()
 
     def forget(self, keys: Iterable[tuple[int, int]]) -> None:

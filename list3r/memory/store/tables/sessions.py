@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.records import Session
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns
@@ -42,8 +42,15 @@ class Sessions:
             raise MemoryFileError(f"{self._connection.path} has no session {session_id}")
         return found
 
+    def check(self, session_id: int) -> None:
+        """Raise `OptionError` for a session that the memory does not have."""
+        known = [s.session_id for s in self.all()]
+        if session_id not in known:
+            text = ", ".join(map(str, known)) or "none"
+            raise OptionError(f"{self._connection.path} has no session {session_id}; it has: {text}")
+
     def put(self, session: Session) -> None:
-        """Write a session anew."""
+        """Write a session again."""
         self._rows.put([session])
 
     def complete(self, session_id: int) -> None:

@@ -1,4 +1,4 @@
-"""Which instances bear words: asked of the table that follows the instances, see `word_index`."""
+"""Which instances have words: asked of the table that follows the instances, see `word_index`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from list3r.memory.store.derived import LruCache
 from list3r.memory.store.word_index import ASK_STAMP, STAMP, expected_words, hundredths
 
 _FEW = 2_000
-"""A word that so few bear leads to the others; bearers of more frequent ones are read whole and kept."""
+"""A word that so few have leads to the others; instances with more frequent ones are read whole and kept."""
 _KEPT_BYTES = 64_000_000
 """Of the bearers of frequent words that were asked for last."""
 _Bearers = tuple[NDArray[np.int64], NDArray[np.int16]]
@@ -30,14 +30,14 @@ class Words:
         """State of the file in which they were read."""
 
     def known(self, words: Iterable[str]) -> set[str]:
-        """Those of some words that any instance bears."""
+        """Those of some words that any instance has."""
         wanted = set(words) - {""}
         if not self._is_current():
             return wanted & {word for word, _, _ in self._expected()}
         return {word for word in wanted if self._connection.rows("SELECT 1 FROM words WHERE word = ? LIMIT 1", (word,))}
 
     def bearing(self, words: Sequence[str], limit: int) -> list[tuple[int, int]]:
-        """Ids of the instances that bear all of some words, with how well those name them together, in hundredths; the
+        """Ids of the instances that have all of some words, with how well those name them together, in hundredths; the
         best first, at most `limit`.
         """
         wanted = sorted(set(words) - {""})
@@ -68,7 +68,7 @@ class Words:
         return list(zip(ids[order].tolist(), total[order].tolist(), strict=True))
 
     def _bearers(self, word: str) -> _Bearers:
-        """Return all that bear a word, from what is kept while the file stays as it is."""
+        """Return all that have a word, from what is kept while the file stays as it is."""
         state = self._connection.stamp()
         if state != self._kept_of:
             self._kept, self._kept_of = _kept(), state
@@ -80,7 +80,7 @@ class Words:
         return kept
 
     def bearing_most(self, words: Sequence[str], limit: int) -> list[list[int]]:
-        """Ids of the instances that bear some words or, of three letters on, words that begin so: those that bear the
+        """Ids of the instances that have some words or, of three letters on, words that begin so: those that have the
         most of them first, one list for each number of words. At most `limit` ids are looked at for each word.
         """
         hits: dict[int, int] = {}
@@ -95,8 +95,8 @@ class Words:
         """Raise `MemoryFileError` where instances are not called by some words as well as the table says."""
         wanted = set(words)
         for i in instances:
-            borne = hundredths(i.label, i.structure, i.description, i.color_name)
-            if sum(borne.get(word, 0) for word in wanted) != totals[i.id] and self._is_current():
+            weights = hundredths(i.label, i.structure, i.description, i.color_name)
+            if sum(weights.get(word, 0) for word in wanted) != totals[i.id] and self._is_current():
                 self._connection.refuse(f"words: those of instance {i.id} are not what it is called")
 
     def _is_current(self) -> bool:

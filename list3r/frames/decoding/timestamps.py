@@ -14,7 +14,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.decoding.boxes import check_index
+from list3r.frames.decoding.mp4_boxes import check_index
 from list3r.frames.files import MAX_PIXELS
 from list3r.frames.folder import DEFAULT_FPS
 from list3r.memory.errors import SourceError
@@ -31,14 +31,14 @@ _WHOLE = {"ignore_editlist": "1"}
 
 
 @dataclass(frozen=True)
-class Stamps:
+class VideoTimestamps:
     """The clock of one video stream."""
 
     stamps: NDArray[np.int64]
     """Stamp of every picture in the order they are shown, ascending, in `unit` seconds; 0, 0, ... without a clock.
     Shape (F,)."""
     keys: NDArray[np.int64]
-    """Stamps of the key frames that decoding can begin at, ascending; empty where pictures are counted. Shape (K,)."""
+    """Time stamps of the key frames where decoding can begin, ascending; empty if pictures are counted. Shape (K,)."""
     unit: Fraction
     rate: float
     """Mean frame rate that the file states."""
@@ -93,25 +93,25 @@ class Stamps:
         return found if found < len(self) and self.stamps[found] == stamp else None
 
     def key_stamps_to(self, number: int, most: int) -> list[int]:
-        """Stamps of up to `most` key frames at or before a frame, the nearest first."""
+        """VideoTimestamps of up to `most` key frames at or before a frame, the nearest first."""
         if self.counted:
             return []
         at = int(np.searchsorted(self.keys, self.stamps[number], side="right"))
         return [int(stamp) for stamp in self.keys[max(0, at - most) : at][::-1]]
 
 
-def list_stamps(path: Path) -> Stamps:
+def list_timestamps(path: Path) -> VideoTimestamps:
     """Return the clock of a video file. Raises `SourceError` for what is none."""
     try:
         found, hidden_s = _listed(path, {})
         return _listed(path, _WHOLE)[0] if 0 < hidden_s <= _PRIMING_S else found
     except av.FFmpegError as error:
         headless = isinstance(error, av.InvalidDataError)
-        reason = "it is none, or breaks off before its index" if headless else error.strerror
+        reason = "it is not one, or ends before its index" if headless else error.strerror
         raise SourceError(f"{path} is not a video that can be read ({reason}); is the copy complete?") from None
 
 
-def _listed(path: Path, words: dict[str, str]) -> tuple[Stamps, float]:
+def _listed(path: Path, words: dict[str, str]) -> tuple[VideoTimestamps, float]:
     """The clock of a file, and for how many seconds before its beginning it has pictures that it does not show."""
     with open_container(path, words) as container:
         if container.format.name in _PLAYLISTS:
@@ -171,10 +171,10 @@ def packets(container: Any, stream: Any) -> Iterator[Any]:
 _NONE = np.iinfo(np.int64).min
 """Of a packet without a stamp, as FFmpeg writes it."""
 _Rows = NDArray[np.int64]
-"""Stamps of showing and of decoding, and whether it is a key frame, of every packet as they come. Shape (F, 3)."""
+"""Time stamps of showing and of decoding, and whether it is a key frame, of every packet as they come. Shape (F, 3)."""
 
 
-def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> Stamps:
+def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> VideoTimestamps:
     if not len(rows):
         raise SourceError(f"{path} holds no frames; is the copy complete?")
     unit = stream.time_base or Fraction(1, 1)
@@ -195,12 +195,12 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> Stamps:
         if joined:
             notes = (
                 *notes,
-                "its clock starts again on the way, as in files that were put together; the parts are joined",
+                "its clock starts again in the middle, as in concatenated files; the parts are joined",
             )
         begins = np.zeros(0, np.int64) if counted else keys[once]
-        return Stamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)
+        return VideoTimestamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)
     none = np.zeros(0, np.int64)
-    return Stamps(np.zeros(len(rows), np.int64), none, unit, rate, False, False, True, aspect, focal, notes)
+    return VideoTimestamps(np.zeros(len(rows), np.int64), none, unit, rate, False, False, True, aspect, focal, notes)
 
 
 def _ascend(stamps: NDArray[np.int64]) -> bool:
@@ -232,12 +232,12 @@ def _other_streams(container: Any) -> tuple[str, ...]:
 def _breaks_off(rows: _Rows, container: Any, stream: Any, unit: Fraction) -> tuple[str, ...]:
     """Return what is said of a file that is shorter than it states."""
     if stream.frames and len(rows) < stream.frames:
-        return (f"the file breaks off: {len(rows)} of its {stream.frames} frames are there",)
+        return (f"the file is cut off: {len(rows)} of its {stream.frames} frames are there",)
     stated = float(container.duration or 0) / float(av.time_base)
     shown = rows[rows[:, 0] != _NONE, 0]
     there = float(int(shown.max() - shown.min()) * unit) if len(shown) else stated
     if there < stated * (1 - _MISSING_SHARE) - 1.0:
-        return (f"the file breaks off: {there:.1f} of its {stated:.1f} seconds are there",)
+        return (f"the file is cut off: {there:.1f} of its {stated:.1f} seconds are there",)
     return ()
 
 

@@ -1,8 +1,8 @@
 """Ask the whole of two chunks whether a relation is true: all that their keyframes saw, of which two saw little.
 
 A relation of two keyframes can rest on a thing that was moved, or that looks like another. Then walls, floor and all
-that stayed lie elsewhere: what one chunk saw hangs in the free space of the other. What the two keyframes saw
-themselves is left out, so that the rest is a witness of its own. Along two walls and the floor a room can be shifted
+that stayed lie elsewhere: what one chunk saw lies in the free space of the other. What the two keyframes saw
+themselves is left out, so that the rest is independent evidence. Along two walls and the floor a room can be shifted
 and they still agree, so it counts how much agrees of what faces the way that agrees least (docs/decisions/0134).
 """
 
@@ -25,31 +25,31 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class WitnessSettings:
-    """When the whole of two chunks speaks for a relation."""
+class ChunkAgreementSettings:
+    """When the whole of two chunks supports a relation."""
 
     points: int = 400
     """Most points of a keyframe that are looked for in the other chunk."""
     met_m: float = 0.02
     """A point lies on a surface within this and"""
     met_sigmas: float = 2.0
-    """so many deviations of the sensor's noise, where both"""
+    """this many deviations of the sensor's noise, where both"""
     least_cosine: float = 0.8
     """have about one direction."""
     through_m: float = 0.05
     """A point is seen through where depth lies further behind it than this and"""
     through_sigmas: float = 3.0
-    """so many deviations."""
+    """this many deviations."""
     near_m: float = 0.1
     """Nearer points are not looked at."""
     prior: float = 0.02
     """Share of all that was seen that is taken to face every way besides, and to agree as all of it does on average:
-    a few points tell nothing."""
+    a few points say nothing."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
 @dataclass(frozen=True)
-class Witness:
+class ChunkAgreement:
     """What the whole of two chunks says of a relation."""
 
     seen: float
@@ -62,7 +62,7 @@ class Witness:
 class ChunkKeyframes:
     """The keyframes of a chunk with depth, as views and as points of the chunk."""
 
-    def __init__(self, keyframes: Sequence[Keyframe], settings: WitnessSettings) -> None:
+    def __init__(self, keyframes: Sequence[Keyframe], settings: ChunkAgreementSettings) -> None:
         self._settings = settings
         self.prior = settings.prior
         self._views = {k.frame_index: (working_view(k), k.T_chunk_cam) for k in keyframes}
@@ -109,7 +109,7 @@ class ChunkKeyframes:
         return on, judged
 
 
-def witness(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[int, int]) -> Witness:
+def chunk_agreement(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[int, int]) -> ChunkAgreement:
     """Return what two chunks say of a relation (4, 4) of two keyframes (Frame.index of u and of v), metres."""
     T_u_v = np.linalg.inv(T_v_u)
     shares = []
@@ -118,7 +118,7 @@ def witness(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[in
         points, normals = source.points[rest], source.normals[rest]
         seen, met = target.fare(points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T)
         shares.append((float(seen.sum()) / max(len(source.points), 1), _least_share(normals, seen, met, u.prior)))
-    return Witness(seen=min(s for s, _ in shares), agreement=min(a for _, a in shares))
+    return ChunkAgreement(seen=min(s for s, _ in shares), agreement=min(a for _, a in shares))
 
 
 def _least_share(normals: Array, seen: Mask, met: Mask, prior: float) -> float:

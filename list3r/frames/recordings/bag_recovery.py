@@ -2,7 +2,7 @@
 
 Both formats are sequences of records and end with an index, without which `rosbags` refuses them. Of an mcap
 (mcap.dev/spec) the end of a file without an index is put after the last whole record; of a ROS 1 bag
-(wiki.ros.org/Bags/Format/2.0) the index is made anew from its whole chunks. Nothing is written.
+(wiki.ros.org/Bags/Format/2.0) the index is made again from its whole chunks. Nothing is written.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class CutOffError(ValueError):
 
 
 @dataclass(frozen=True)
-class MendedFile:
+class RecoveredFile:
     """A recording as it would be had its recorder ended it after the last whole record.
 
     It has of a path what `rosbags` asks of one.
@@ -74,8 +74,8 @@ class MendedFile:
 class _Spliced(io.RawIOBase):
     """Head, middle from the file, tail."""
 
-    def __init__(self, mended: MendedFile) -> None:
-        self._mended, self._file, self._at = mended, mended.path.open("rb"), 0
+    def __init__(self, recovered: RecoveredFile) -> None:
+        self._recovered, self._file, self._at = recovered, recovered.path.open("rb"), 0
 
     def readable(self) -> bool:
         return True
@@ -84,12 +84,12 @@ class _Spliced(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        base = (0, self._at, self._mended.end + len(self._mended.tail))[whence]
+        base = (0, self._at, self._recovered.end + len(self._recovered.tail))[whence]
         self._at = max(0, base + offset)
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        m, count = self._mended, len(buffer)
+        m, count = self._recovered, len(buffer)
         if self._at < len(m.head):
             data = m.head[self._at : self._at + count]
         elif self._at < m.end:
@@ -106,31 +106,31 @@ class _Spliced(io.RawIOBase):
         super().close()
 
 
-def mended(path: Path, decompressors: Mapping[str, Callable[..., bytes]]) -> MendedFile | None:
+def recovered(path: Path, decompressors: Mapping[str, Callable[..., bytes]]) -> RecoveredFile | None:
     """Return a recording that lacks its end as one that has it; None for one that is whole, of another kind, or of
     which nothing is.
 
     `decompressors` unpack the chunks of a bag, by name. Raises `OSError`.
     """
     stat = path.stat()
-    return _mended(path, stat.st_size, stat.st_mtime_ns, tuple(decompressors.items()))
+    return _recovered(path, stat.st_size, stat.st_mtime_ns, tuple(decompressors.items()))
 
 
 @lru_cache(maxsize=8)
-def _mended(
+def _recovered(
     path: Path, size: int, _: int, decompressors: tuple[tuple[str, Callable[..., bytes]], ...]
-) -> MendedFile | None:
+) -> RecoveredFile | None:
     with path.open("rb") as file:
         begins = file.read(len(_BAG))
         if begins.startswith(_MCAP):
-            return _mended_mcap(path, file, size)
-        return _mended_bag(path, file, size, dict(decompressors)) if begins == _BAG else None
+            return _recovered_mcap(path, file, size)
+        return _recovered_bag(path, file, size, dict(decompressors)) if begins == _BAG else None
 
 
 # ---------------------------------------------------------------------------------------------- mcap
 
 
-def _mended_mcap(path: Path, file: BinaryIO, size: int) -> MendedFile | None:
+def _recovered_mcap(path: Path, file: BinaryIO, size: int) -> RecoveredFile | None:
     file.seek(max(0, size - len(_MCAP)))
     if file.read() == _MCAP and size > len(_MCAP):
         return None
@@ -142,7 +142,7 @@ def _mended_mcap(path: Path, file: BinaryIO, size: int) -> MendedFile | None:
         if code in (0, _MCAP_DATA_END, _MCAP_FOOTER) or at + 9 + length > size:
             break
         at, records = at + 9 + length, records + 1
-    return MendedFile(path, b"", at, size, _MCAP_TAIL) if records > 1 else None
+    return RecoveredFile(path, b"", at, size, _MCAP_TAIL) if records > 1 else None
 
 
 # ---------------------------------------------------------------------------------------------- bags of ROS 1
@@ -201,9 +201,9 @@ def _records(file: BinaryIO, at: int, size: int) -> Iterator[_Record]:
         at = record.stop
 
 
-def _mended_bag(
+def _recovered_bag(
     path: Path, file: BinaryIO, size: int, decompressors: dict[str, Callable[..., bytes]]
-) -> MendedFile | None:
+) -> RecoveredFile | None:
     try:
         first = _record(file, len(_BAG), size)
         if first.code != _BAG_HEADER or _is_indexed(file, first, size):
@@ -242,11 +242,11 @@ def _mended_bag(
         place = header.find(name + b"=") + len(name) + 1
         header = header[:place] + value.to_bytes(width, "little") + header[place + width :]
     head = _BAG + struct.pack("<I", len(header)) + header
-    return MendedFile(path, head, end, size, tail)
+    return RecoveredFile(path, head, end, size, tail)
 
 
 def _is_indexed(file: BinaryIO, first: _Record, size: int) -> bool:
-    """Whether a bag has the whole index that its header speaks of."""
+    """Whether a bag has the whole index that its header refers to."""
     at, wanted = first.number(b"index_pos"), first.number(b"conn_count") + first.number(b"chunk_count")
     return 0 < at <= size and sum(1 for _ in _records(file, at, size)) >= wanted
 

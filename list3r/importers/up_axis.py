@@ -13,11 +13,11 @@ _TOUCH_M = 0.04
 _SHARE = 0.7
 """Of a thing's footprint that lies on what it stands on."""
 _LEAST, _TIMES = 4, 2.0
-"""Another axis is up where so many things stand along it, and so many times more than along the stated one."""
+"""Another axis is up where this many things stand along it, and this many times more than along the stated one."""
 _MOST_THINGS = 1500
 
 
-def doubt_of_up(things: Sequence[NDArray[np.float32]], up: str) -> tuple[str, ...]:
+def up_axis_notes(things: Sequence[NDArray[np.float32]], up: str) -> tuple[str, ...]:
     """Return what to say where things, by their points (N, 3) each, plainly stand along another axis than `up`."""
     if len(things) > _MOST_THINGS:
         return ()

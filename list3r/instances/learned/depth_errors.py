@@ -21,7 +21,7 @@ from list3r.instances.learned.graph import ChunkSurface
 
 
 @dataclass(frozen=True)
-class DoubtSettings:
+class DepthErrorSettings:
     """What the errors of computed depth explain; chosen on walks 41 and 42 of `benchmarks/colour.py`."""
 
     deviations: float = 2.0
@@ -53,7 +53,7 @@ def voxel_doubt(views: ChunkViews, cloud: Cloud) -> NDArray[np.float32]:
 
 
 def without_bends(
-    surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane], doubt: NDArray[np.float32], s: DoubtSettings
+    surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane], doubt: NDArray[np.float32], s: DepthErrorSettings
 ) -> CloudCut:
     """Return the cut with what is a patch of a wall or floor joined to it: what lies in the plane of a structure within
     the doubt of depth (N,), and what no border in the pictures parts from what is round it.
@@ -103,7 +103,9 @@ def rim_steps(surface: ChunkSurface, cut: CloudCut, reach_px: int) -> NDArray[np
     return out
 
 
-def without_slivers(cloud: Cloud, cut: CloudCut, doubt: NDArray[np.float32], s: DoubtSettings, most: float) -> CloudCut:
+def without_slivers(
+    cloud: Cloud, cut: CloudCut, doubt: NDArray[np.float32], s: DepthErrorSettings, most: float
+) -> CloudCut:
     """Return the cut in which what is narrower than the doubt of its depth (N,) is one whole with at most the
     probability `most`.
     """

@@ -37,7 +37,7 @@ class LazyFrame(Frame):
         return self.__dict__[name]
 
     def let_go(self) -> None:
-        """Forget the picture, which is read anew where it is asked for again."""
+        """Forget the picture, which is read again where it is asked for again."""
         for name in ("color", "depth"):
             self.__dict__.pop(name, None)
 

@@ -1,4 +1,4 @@
-"""Which instances words mean, for `nearest`: a phrase as `find` reads it, else those that bear the words."""
+"""Which instances words mean, for `nearest`: a phrase as `find` reads it, else those that have the words."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from list3r.queries.views.gather import is_large, sample
 _LOADED = 5_000
 """Instances that are looked at because of what they are called, in a memory that holds many."""
 _NAMED = 100_000
-"""Instances that may bear one word, at the most."""
+"""Most instances that have one word."""
 
 
-def called(
+def named_by(
     store: Store,
     words: str,
     origin: Instance | None,
@@ -28,12 +28,12 @@ def called(
     encoder: WordEncoder | None,
     notes: list[str],
 ) -> list[tuple[Instance, float, str]]:
-    """Return what the words say, with how well and why: a phrase as `find` reads it, else things that bear them."""
+    """Return what the words say, with how well and why: a phrase as `find` reads it, else things that have them."""
     if _says_more_than_names(words):
         found, search = meant(store, parse(words), encoder=encoder)
         notes += search.notes
         return [(c.instance, c.score, "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
-    others = [i for i in _bearers(store, words, filters, notes) if origin is None or i.id != origin.id]
+    others = [i for i in _with_words(store, words, filters, notes) if origin is None or i.id != origin.id]
     named = _named(others, words)
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
@@ -51,14 +51,14 @@ def _says_more_than_names(words: str) -> bool:
 
 
 def only_common(store: Store, words: str) -> bool:
-    """Tell whether the words only name, and so many bear them that it is better to look around than at all of them."""
+    """Tell whether the words only name, and so many have them that it is better to look around than at all of them."""
     if _says_more_than_names(words):
         return False
     return len(store.words.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
 
 
-def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
-    """Return what passes the filters: all; of a large memory those that bear the most of the words."""
+def _with_words(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:
+    """Return what passes the filters: all; of a large memory those that have the most of the words."""
     if not is_large(store):
         return filters.select(store.instances.all())
     parts = (
@@ -80,7 +80,7 @@ def _bearers(store: Store, words: str, filters: Filters, notes: list[str]) -> li
 def _alike(
     store: Store, encoder: WordEncoder, words: str, filters: Filters, notes: list[str]
 ) -> list[tuple[Instance, float, str]]:
-    """Return things whose vectors fit words that nothing bears."""
+    """Return things whose vectors fit words that no instance has."""
     try:
         cosine = named_by_vectors(store, encoder, words) or {}
     except OptionError as error:  # the memory has come to a machine without the model's weights
@@ -91,7 +91,7 @@ def _alike(
 
 
 def _named(candidates: Sequence[Instance], words: str) -> list[tuple[Instance, float, str]]:
-    """Return those that bear the words: all of them where some thing does, else as many as any thing does."""
+    """Return those that have the words: all of them where some thing does, else as many as any thing does."""
     wanted = wanted_words(words)
     found = [(i, *word_score(i, wanted)) for i in candidates]
     most = max((len(hit) for _, _, hit in found), default=0)

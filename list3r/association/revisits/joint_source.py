@@ -1,4 +1,4 @@
-"""Joint windows of RGB-D videos: the frames of both places are read again and reconstructed together."""
+"""Joint windows from the sources of a memory: the frames of both places are read again and reconstructed together."""
 
 from __future__ import annotations
 
@@ -11,24 +11,18 @@ from list3r.memory.errors import TrackingError
 from list3r.memory.records import JointWindow
 from list3r.reconstruction.base import Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.keyframe_record import frame_samples
-from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 
 
-class RgbdJointReconstructor:
+class JointSourceReconstructor:
     """A `JointReconstructor` that reads the sessions' sources, opened when a window is first asked for.
 
-    By session id `paths` are those of the sources, `options` what it was built with; the defaults where that is silent.
+    By session id, `paths` are those of the sources and `options` those of the build; defaults if not set.
     """
 
     def __init__(
-        self,
-        paths: Mapping[int, str],
-        options: Mapping[int, SourceOptions] | None = None,
-        reconstructor: Reconstructor | None = None,
+        self, paths: Mapping[int, str], options: Mapping[int, SourceOptions], reconstructor: Reconstructor
     ) -> None:
-        self._paths = paths
-        self._options = dict(options or {})
-        self._reconstructor = reconstructor or RgbdReconstructor(poses="estimate")
+        self._paths, self._options, self._reconstructor = paths, options, reconstructor
         self._sources: dict[int, FrameSource] = {}
 
     def __call__(

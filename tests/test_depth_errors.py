@@ -8,7 +8,7 @@ import pytest
 from list3r.instances.geometric.cloud import Cloud
 from list3r.instances.geometric.planes import find_planes
 from list3r.instances.learned.cut import CloudCut
-from list3r.instances.learned.doubt import DoubtSettings, rim_steps, without_bends, without_slivers
+from list3r.instances.learned.depth_errors import DepthErrorSettings, rim_steps, without_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings
 from list3r.instances.learned.things import ThingVerdicts
 
@@ -43,13 +43,13 @@ def test_a_bent_patch_without_a_border_is_wall(bend_m: float, tone: float, thing
     surface, cut = wall(bend_m, tone)
     planes = [p for p in find_planes(surface.cloud, 0.2, 1.0) if len(p.members) > 2000]
     doubt = np.full(len(cut.labels), 0.05, np.float32)
-    left = without_bends(surface, cut, planes, doubt, DoubtSettings())
+    left = without_bends(surface, cut, planes, doubt, DepthErrorSettings())
     assert len(left.told.structure) == things and (left.labels >= 0).all()
 
 
 def test_the_step_across_a_rim_is_that_of_the_pictures() -> None:
     surface, cut = wall(0.06, 12.0)
-    steps = rim_steps(surface, cut, DoubtSettings().reach_px)
+    steps = rim_steps(surface, cut, DepthErrorSettings().reach_px)
     assert steps[1] == pytest.approx(12.0) and np.isinf(steps[0])
 
 
@@ -57,5 +57,5 @@ def test_the_step_across_a_rim_is_that_of_the_pictures() -> None:
 def test_what_is_narrower_than_its_doubt_is_seldom_whole(doubt_m: float, whole: float) -> None:
     surface, cut = wall(0.06, 12.0)
     doubt = np.full(len(cut.labels), doubt_m, np.float32)
-    found = without_slivers(surface.cloud, cut, doubt, DoubtSettings(), 0.3)
+    found = without_slivers(surface.cloud, cut, doubt, DepthErrorSettings(), 0.3)
     assert found.told.whole[1] == pytest.approx(whole) and found.told.whole[0] == pytest.approx(0.1)
