@@ -484,7 +484,7 @@ def test_a_lost_network_is_told_and_nothing_is_half_written(server: PostgresServ
             network.cut()
             yield from held.things[60:]
 
-        with pytest.raises(CatalogError, match="cannot be written; the same again is safe") as told:
+        with pytest.raises(CatalogError, match="cannot be written; running the same command again is safe") as told:
             backend.put(replace(held, things=things()))  # type: ignore[arg-type]
         assert "\n" not in str(told.value)
         with pytest.raises(CatalogError, match="cannot be asked") as told:

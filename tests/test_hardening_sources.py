@@ -178,7 +178,7 @@ def test_poses_that_are_none_are_noted(case: str, tmp_path: Path) -> None:
         T = np.eye(4)
         WRONG[case](T)
         np.savetxt(path, T)
-    assert "4 of 4 poses looked at are no rigid motion" in notes(root)
+    assert "4 of 4 poses looked at are not rigid motions" in notes(root)
 
 
 @pytest.mark.parametrize("value", [0, 65535, 1, 40000])
