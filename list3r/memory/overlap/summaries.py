@@ -183,7 +183,9 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     nodes = store.local_instances.nodes([chunk.chunk_id])
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(store, chunk)
-    shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
+    step = store.sessions.get(chunk.session_id).depth_step or 1
+    named = {"chunk_id": chunk.chunk_id, "session_id": chunk.session_id, "step": step}
+    shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, **named)
     if chunk.scale_kind != "metric":
         shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]

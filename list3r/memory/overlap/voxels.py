@@ -121,6 +121,12 @@ class ChunkShapes:
     """Where depth was computed in every third frame: ascending keys of frame and pixel; none of a sensor. (S,)."""
     sample_owner: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
+    stands_for: int = 1
+    """Frames of the recording that one of `frames` stands for: itself, and those after it that were passed over."""
+
+    def seen_for(self, at: int) -> int:
+        """Return in how many frames of the recording an instance (0 to N - 1) is seen, passed over ones included."""
+        return self.stands_for * len(self.frames[at])
 
     def only(self, kept: NDArray[np.bool_]) -> ChunkShapes:
         """Return some of the instances, (N,). Samples of the others still belong to something: they have the numbers
@@ -173,10 +179,12 @@ def chunk_shapes(
     *,
     chunk_id: int,
     session_id: int = 1,
+    step: int = 1,
 ) -> ChunkShapes:
     """Enter the local instances of one chunk in their grids.
 
-    `image_size` is (height, width); `unit` is what a metre is in chunk units.
+    `image_size` is (height, width); `unit` is what a metre is in chunk units; things are looked for in every `step`-th
+    frame.
     """
     s = settings or ShapeSettings()
     nodes = sorted(nodes, key=lambda n: n.local_id)
@@ -226,7 +234,18 @@ def chunk_shapes(
         boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
         areas_px=tuple(n.areas_px for n in nodes),
         visible_fraction=tuple(n.visible_fraction for n in nodes),
+        stands_for=_stands_for(nodes, step),
     )
+
+
+def _stands_for(nodes: Sequence[LocalNode], step: int) -> int:
+    """Return how many frames one stands for where every `step`-th was to be read: less where the chunk was read more
+    densely, as by the gaps between frames in which anything is seen.
+    """
+    if step == 1 or not nodes:
+        return step
+    gaps = np.diff(np.unique(np.concatenate([n.frames for n in nodes])))
+    return min(step, int(np.median(gaps))) if len(gaps) else step
 
 
 SAMPLED_FRAMES = 3
