@@ -329,7 +329,8 @@ def lies_on(points: Array, target: ChunkShapes) -> NDArray[np.bool_]:
     return found
 
 
-_KEPT_BYTES = 8 << 20
+_KEPT_BYTES = 32 << 20
+"""Those of some 70 chunks with a dozen things: of a place that many sessions saw, all are asked for with each chunk."""
 
 
 @dataclass(frozen=True)
