@@ -18,7 +18,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import Sim3, rotation_exp
 from list3r.memory.library.evidence import EvidenceSettings, weigh
 from list3r.memory.overlap.pair_scores import pair_scores
-from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes
+from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes, read_every
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings
@@ -152,7 +152,8 @@ def test_a_build_is_the_same_with_any_number_of_processes(walk: Path, tmp_path: 
 
 def seen_in(chunk_id: int, frames: np.ndarray, step: int) -> ChunkShapes:
     """A chunk that sees a mug in some frames, of which every `step`-th was to be read."""
-    return chunk_shapes([node(chunk_id, 0, surface(MUG, chunk_id), frames=frames)], IMAGE, chunk_id=chunk_id, step=step)
+    nodes = [node(chunk_id, 0, surface(MUG, chunk_id), frames=frames)]
+    return read_every(chunk_shapes(nodes, IMAGE, chunk_id=chunk_id), step)
 
 
 def test_a_frame_counts_for_those_that_were_passed_over_beside_it() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.planes import Planes, chunk_planes
-from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, with_samples
+from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, read_every, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.derived import LruCache
@@ -196,9 +196,8 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     nodes = store.local_instances.nodes([chunk.chunk_id])
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(store, chunk)
-    step = store.sessions.get(chunk.session_id).depth_step or 1
-    named = {"chunk_id": chunk.chunk_id, "session_id": chunk.session_id, "step": step}
-    shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, **named)
+    shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
+    shapes = read_every(shapes, store.sessions.get(chunk.session_id).depth_step or 1)
     if chunk.scale_kind != "metric":
         shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]

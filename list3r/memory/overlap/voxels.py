@@ -179,12 +179,10 @@ def chunk_shapes(
     *,
     chunk_id: int,
     session_id: int = 1,
-    step: int = 1,
 ) -> ChunkShapes:
     """Enter the local instances of one chunk in their grids.
 
-    `image_size` is (height, width); `unit` is what a metre is in chunk units; things are looked for in every `step`-th
-    frame.
+    `image_size` is (height, width); `unit` is what a metre is in chunk units.
     """
     s = settings or ShapeSettings()
     nodes = sorted(nodes, key=lambda n: n.local_id)
@@ -234,18 +232,18 @@ def chunk_shapes(
         boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
         areas_px=tuple(n.areas_px for n in nodes),
         visible_fraction=tuple(n.visible_fraction for n in nodes),
-        stands_for=_stands_for(nodes, step),
     )
 
 
-def _stands_for(nodes: Sequence[LocalNode], step: int) -> int:
-    """Return how many frames one stands for where every `step`-th was to be read: less where the chunk was read more
-    densely, as by the gaps between frames in which anything is seen.
+def read_every(shapes: ChunkShapes, step: int) -> ChunkShapes:
+    """Return the shapes of a chunk of which every `step`-th frame was to be read.
+
+    One stands for less where the chunk was read more densely, as by the gaps between frames in which anything is seen.
     """
-    if step == 1 or not nodes:
-        return step
-    gaps = np.diff(np.unique(np.concatenate([n.frames for n in nodes])))
-    return min(step, int(np.median(gaps))) if len(gaps) else step
+    if step == 1 or not shapes.frames:
+        return shapes
+    gaps = np.diff(np.unique(np.concatenate(shapes.frames)))
+    return replace(shapes, stands_for=min(step, int(np.median(gaps))) if len(gaps) else step)
 
 
 SAMPLED_FRAMES = 3
