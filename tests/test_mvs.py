@@ -291,6 +291,15 @@ def test_compiled_matching_costs_are_those_of_tensors(each: bool) -> None:
     )
 
 
+@pytest.mark.parametrize("shape", [(1, 3, 5), (2, 1, 2), (17, 23, 31)])
+def test_compiled_path_costs_are_those_of_tensors_to_the_last_bit(shape: tuple[int, int, int]) -> None:
+    rng, settings = np.random.default_rng(7), SweepSettings()
+    volume, gray = (torch.from_numpy(rng.random(s, np.float32)) for s in (shape, shape[:2]))
+    found = sweep._paths(volume, gray, settings)
+    assert torch.equal(found, sweep._paths_of_tensors(volume, gray, settings))
+    assert (found >= 0).all() and found.std() > 0.1
+
+
 def test_depth_is_carried_to_where_it_is_seen_and_the_nearest_counts() -> None:
     rng, camera = np.random.default_rng(6), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     inverse = np.where(rng.random((30, 40)) < 0.8, 0.5, 0.0).astype(np.float32)

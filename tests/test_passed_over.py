@@ -15,11 +15,15 @@ from list3r.frames.base import BadFrame, Frame
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.deferred import LazyFrame, read_some
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.library.evidence import EvidenceSettings, weigh
+from list3r.memory.overlap.pair_scores import pair_scores
+from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes, read_every
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor, _pose_passed
+from tests.memory_scenes import IMAGE, MUG, node, surface
 from tests.rgbd_scenes import CAMERA, render
 
 COUNT = 22
@@ -144,3 +148,28 @@ def test_a_build_is_the_same_with_any_number_of_processes(walk: Path, tmp_path: 
             found.append((np.stack([S.as_matrix() for _, S in rows]), sorted(seen), store.chunks.checksums()))
     assert len(found[0][0]) == COUNT and found[0][1] == list(range(0, COUNT, 2))
     assert np.array_equal(found[0][0], found[1][0]) and found[0][1:] == found[1][1:]
+
+
+def seen_in(chunk_id: int, frames: np.ndarray, step: int) -> ChunkShapes:
+    """A chunk that sees a mug in some frames, of which every `step`-th was to be read."""
+    nodes = [node(chunk_id, 0, surface(MUG, chunk_id), frames=frames)]
+    return read_every(chunk_shapes(nodes, IMAGE, chunk_id=chunk_id), step)
+
+
+def test_a_frame_counts_for_those_that_were_passed_over_beside_it() -> None:
+    every, third = np.arange(300, 336), np.arange(300, 336, 3)
+    assert seen_in(1, every, 1).seen_for(0) == seen_in(1, third, 3).seen_for(0) == 36
+    assert seen_in(1, every, 3).seen_for(0) == 36  # where all frames had to be read
+    assert seen_in(1, third, 1).seen_for(0) == 12
+
+
+def test_evidence_counts_the_time_of_the_recording_not_what_was_read_of_it() -> None:
+    groups = [[(1, 0), (2, 0)]]
+
+    def told(step: int) -> tuple[int, float, int]:
+        chunks = {k: seen_in(k, np.arange(first, first + 36, step), step) for k, first in ((1, 300), (2, 318))}
+        pairs = {(1, 2): pair_scores(chunks[1], chunks[2], Sim3.identity())}
+        found = weigh(groups, chunks, pairs, EvidenceSettings())[0]
+        return found.frames, found.confidence, int(pairs[1, 2].shared[0])
+
+    assert told(1) == told(2) == told(3) and told(1)[0] == 54 and told(1)[2] == 18

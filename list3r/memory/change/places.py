@@ -307,8 +307,9 @@ class Places:
         return sum(self.frames_in(n, s) for s in self.sessions[n] if s < before)
 
     def frames_in(self, n: int, session: int) -> int:
-        """Return frames of one session in which an instance was seen."""
-        return len({f for _, f in self._sightings(n, session)})
+        """Return frames of one session's recording in which an instance was seen."""
+        own = [self.shapes[k].stands_for for k, _ in self.groups[n] if self.rows[k].session_id == session]
+        return max(own, default=1) * len({f for _, f in self._sightings(n, session)})
 
     def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
         """Return the frames of a session that see most of an instance."""

@@ -45,7 +45,7 @@ class Evidence:
     """What speaks for and against one group."""
 
     frames: int
-    """Different frames in which it is seen."""
+    """Different frames of the recording in which it is seen, see `ChunkShapes.stands_for`."""
     found: int
     """Chunks that found it."""
     swallowed: int
@@ -87,7 +87,7 @@ def weigh(
     home = numbering.homes(groups)
     weighed = np.zeros(len(groups) + 1, dtype=bool)
     weighed[list(range(len(groups)) if wanted is None else wanted)] = True
-    frames = [_frames_of(g, chunks) if weighed[n] else set() for n, g in enumerate(groups)]
+    frames = [_frames_of(g, chunks) if weighed[n] else 0 for n, g in enumerate(groups)]
     chunk_of = np.array([k for k, _ in numbering.keys], np.int64)
     meet = PairTable.of(pairs, numbering)
     against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
@@ -117,7 +117,7 @@ def weigh(
         asked = weighed[n] and not all(_bounds(chunks, key) for key in group)
         silent = {v for u in own for v in beside.get(u, {})} - own - against[n].keys() if asked else set()
         missed = sum(misses(v, group, chunks, beside, settings.looks) for v in silent)
-        found = Evidence(len(frames[n]), len(own), sum(votes.values()), ranked, missed)
+        found = Evidence(frames[n], len(own), sum(votes.values()), ranked, missed)
         if weighed[n]:
             sure = settings.weights.probability(signs_of(group, chunks, found.frames))
             found = replace(found, confidence=sure * found.agreement)
@@ -146,15 +146,15 @@ def _bounds(chunks: Mapping[int, ChunkShapes], key: Key) -> bool:
     return chunk is not None and bool(chunk.structure[int(np.searchsorted(chunk.local_id, key[1]))])
 
 
-def _frames_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes]) -> set[tuple[int, int]]:
-    """Return (session id, Frame.index) of the frames in which a group is seen."""
-    seen: set[tuple[int, int]] = set()
+def _frames_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes]) -> int:
+    """Return in how many different frames of the recording a group is seen."""
+    seen: dict[tuple[int, int], int] = {}
     for chunk_id, local_id in group:
         if chunk_id in chunks:
             shapes = chunks[chunk_id]
             at = int(np.searchsorted(shapes.local_id, local_id))
-            seen.update((shapes.session_id, f) for f in shapes.frames[at].tolist())
-    return seen
+            seen |= {(shapes.session_id, f): shapes.stands_for for f in shapes.frames[at].tolist()}
+    return sum(seen.values())
 
 
 def contested(

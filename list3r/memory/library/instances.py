@@ -193,7 +193,7 @@ def derive_instance(
     keep = without_strays(points)
     points, rgb = points[keep], rgb[keep]
     frames = _frames(members)
-    counts = np.array([len(m.shapes.frames[m.at]) for m in members], dtype=np.float64)
+    counts = np.array([m.shapes.seen_for(m.at) for m in members], dtype=np.float64)
     feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
     box = fit_box(points, upright=upright, trim=s.trim)
     geometry = InstanceGeometry(

@@ -135,6 +135,11 @@ class Region:
         shapes = self.shapes(key[0])
         return shapes.frames[int(np.searchsorted(shapes.local_id, key[1]))]
 
+    def seen_for(self, key: Key) -> int:
+        """Return in how many frames of the recording a local instance is seen, passed over ones included."""
+        shapes = self.shapes(key[0])
+        return shapes.seen_for(int(np.searchsorted(shapes.local_id, key[1])))
+
     def pose(self, chunk_id: int) -> Sim3:
         """Return S_world_chunk where the chunk is settled."""
         if chunk_id not in self._poses:

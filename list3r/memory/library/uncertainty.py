@@ -22,7 +22,7 @@ class Signs:
     stability: float
     """How probably its members are one thing each, times how well their masks fit; mean weighted by their frames."""
     frames: int
-    """Different frames in which it is seen, at least 1."""
+    """Different frames of the recording in which it is seen, at least 1."""
     area: float
     """Share of what is seen in a frame that its mask covers, in the middle of its frames."""
     size_m: float
@@ -34,7 +34,7 @@ class Signs:
 def signs_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes], frames: int) -> Signs:
     """Return the signs of a group that is seen in so many different frames."""
     own = [(chunks[k], int(np.searchsorted(chunks[k].local_id, n))) for k, n in group]
-    weight = [max(1, len(c.frames[at])) for c, at in own]
+    weight = [max(1, c.seen_for(at)) for c, at in own]
     rows = [(c.stability[at], _area(c, at), c.size[at] / c.unit, c.structure[at]) for c, at in own]
     stability, area, size, structure = np.average(np.array(rows, np.float64), axis=0, weights=weight).tolist()
     return Signs(stability, max(frames, 1), area, size, structure)

@@ -131,7 +131,7 @@ class Weighing:
         before = self._g.constraints.remembered(groups, self._region.store.observations.owners(keys))
         before = without_missed(before, groups, [weighed.evidence.get(g, _UNWEIGHED) for g in groups], visible)
         within = [None if (w := inner.get(g)) is None else at[w] for g in groups]
-        weights = {key: len(self._region.frames_of(key)) for key in keys}
+        weights = {key: self._region.seen_for(key) for key in keys}
         ids = assign_ids(groups, before, weights, visible, within, self._region.store.ids.next())
         return Named(ids, groups, before)
 

@@ -139,7 +139,7 @@ class Writer:
             return {}
         self._g.look_up({k for k, _ in named})
         groups = sorted({*fresh.values(), *(self._g.home[k] for k in named if k in self._g.home)})
-        weights = {k: len(self._region.frames_of(k)) for g in groups for k in g}
+        weights = {k: self._region.seen_for(k) for g in groups for k in g}
         of = {g: n for n, g in fresh.items()}
         found = self._g.constraints.labels_of(groups, weights)
         return {of[groups[at]]: text for at, text in found.items() if groups[at] in of}

@@ -211,6 +211,10 @@ class _Scene:
     def frames(self, key: Key) -> NDArray[np.int64]:
         return self._shapes[key[0]].frames[self.at(key)]
 
+    def _recorded(self, a: Key, b: Key, frames: int) -> int:
+        """Return how many frames of the recording so many that two local instances share stand for."""
+        return frames * min(self._shapes[k].stands_for for k, _ in (a, b))
+
     def size(self, key: Key) -> float:
         shape = self._shapes[key[0]]
         return float(shape.size[self.at(key)] * self._placed[key[0]].scale)
@@ -245,7 +249,7 @@ class _Scene:
         s = self._s
         common, at_a, at_b = np.intersect1d(self.frames(a), self.frames(b), return_indices=True)
         large, small = max(self.size(a), self.size(b)), min(self.size(a), self.size(b))
-        if len(common) < s.min_shared_frames or large > s.max_size_ratio * max(small, 1e-9):
+        if self._recorded(a, b, len(common)) < s.min_shared_frames or large > s.max_size_ratio * max(small, 1e-9):
             return None
         boxes_a = self._shapes[a[0]].boxes_xyxy[self.at(a)][at_a].astype(float)
         boxes_b = self._shapes[b[0]].boxes_xyxy[self.at(b)][at_b].astype(float)
@@ -282,7 +286,8 @@ class _Scene:
     def seen_apart(self, a: Key, b: Key) -> bool:
         """Return whether two local instances have frames in common in which they are two."""
         common, at_a, at_b = np.intersect1d(self.frames(a), self.frames(b), return_indices=True)
-        if self._shapes[a[0]].session_id != self._shapes[b[0]].session_id or len(common) < self._s.min_shared_frames:
+        recorded = self._recorded(a, b, len(common))
+        if self._shapes[a[0]].session_id != self._shapes[b[0]].session_id or recorded < self._s.min_shared_frames:
             return False
         boxes_a = self._shapes[a[0]].boxes_xyxy[self.at(a)][at_a].astype(float)
         boxes_b = self._shapes[b[0]].boxes_xyxy[self.at(b)][at_b].astype(float)

@@ -7,6 +7,7 @@ scale of the chunk (decision 0022).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -69,7 +70,7 @@ def misses(
         if _mask_iou(mine[known & well[at]], frames[well], chunks[other]) >= s.same_iou:
             return False
         seen.update(frames[well].tolist())
-    return SAMPLED_FRAMES * len(seen) >= s.least_frames
+    return math.lcm(SAMPLED_FRAMES, chunks[other].stands_for) * len(seen) >= s.least_frames
 
 
 def _mask_iou(mine: Ints, frames: Ints, other: ChunkShapes) -> float:

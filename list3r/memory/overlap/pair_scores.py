@@ -29,7 +29,7 @@ class PairScores:
     j_on_i: Array
     """Share of j's surface that lies on i. Shape (E,)."""
     shared: Ints
-    """Frames in which both are seen. Shape (E,)."""
+    """Frames of the recording in which both are seen. Shape (E,)."""
     frame_iou: Array
     """Mean IoU of their boxes in those frames. Shape (E,)."""
 
@@ -66,7 +66,7 @@ def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
         cell = np.ix_(owner_u[at_u], owner_v[at_v])
         count[cell] += 1
         total[cell] += box_iou(boxes_u[at_u], boxes_v[at_v])
-    return count, total / np.maximum(count, 1)
+    return count * min(u.stands_for, v.stands_for), total / np.maximum(count, 1)
 
 
 def box_iou(a: Array, b: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.planes import Planes, chunk_planes
-from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, with_samples
+from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, read_every, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.derived import LruCache
@@ -41,10 +41,19 @@ class ChunkSummary:
     """The local instances that move, by local id, and where they were; what bounds a room never does."""
 
     @property
-    def lab(self) -> Array:
-        """Colours of a sample of all its points, CIE L*a*b*. Shape (C, 3)."""
+    def sampled(self) -> SampledChunk:
+        """What is asked of it where it is one of those that tell what holds for the whole memory."""
         rgb = self.shapes.rgb
-        return lab_from_rgb(rgb[:: max(1, len(rgb) // _COLORS)])
+        return SampledChunk(self.planes, rgb[:: max(1, len(rgb) // _COLORS)].copy())
+
+
+@dataclass(frozen=True)
+class SampledChunk:
+    """What one chunk tells of the whole memory: which way is up, and the light."""
+
+    planes: Planes
+    rgb: NDArray[np.uint8]
+    """Colours of a sample of all its points. Shape (C, 3)."""
 
 
 _KEPT_BYTES = 48 << 20
@@ -80,9 +89,9 @@ class _HeldSummaries(LruCache[tuple[int, frozenset[int]], ChunkSummary]):
         super().__init__(_HELD_BYTES, _bytes_of)
 
 
-class PlanesCache(LruCache[tuple[int, int], Planes]):
-    """Planes by chunk id and checksum of what the chunk measured: of up to 64 chunks they are asked for with every new
-    one, when much of what those saw is left out of their summaries.
+class SampledCache(LruCache[tuple[int, int], SampledChunk]):
+    """By chunk id and checksum of what the chunk measured: of up to 64 chunks planes are asked for with every new one,
+    when much of what those saw is left out of their summaries, and of the same ones colours when a session ends.
     """
 
     def __init__(self) -> None:
@@ -128,8 +137,12 @@ class Summaries(Mapping[int, ChunkSummary]):
 
     def planes(self, chunk_id: int) -> Planes:
         """Return the planes of a chunk."""
-        known, key = self._store.derived.of(PlanesCache), (chunk_id, self._checksum(chunk_id))
-        return known.get(key) or known.put(key, self[chunk_id].planes)
+        return self.sampled(chunk_id).planes
+
+    def sampled(self, chunk_id: int) -> SampledChunk:
+        """Return what a chunk tells of the whole memory."""
+        known, key = self._store.derived.of(SampledCache), (chunk_id, self._checksum(chunk_id))
+        return known.get(key) or known.put(key, self[chunk_id].sampled)
 
     def _checksum(self, chunk_id: int) -> int:
         if chunk_id not in self._checked:
@@ -184,6 +197,7 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     planes = chunk_planes(nodes)
     unit = 1.0 if chunk.scale_kind == "metric" else _unit(store, chunk)
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
+    shapes = read_every(shapes, store.sessions.get(chunk.session_id).depth_step or 1)
     if chunk.scale_kind != "metric":
         shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
@@ -226,7 +240,9 @@ def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
 
 def light_of(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> Reference:
     """Return the light of a memory, from the colours of its chunks."""
-    return scene_reference(np.concatenate([summaries[c.chunk_id].lab for c in sample_of(chunks)] or [np.zeros((0, 3))]))
+    ids = [c.chunk_id for c in sample_of(chunks)]
+    told = [summaries.sampled(k) if isinstance(summaries, Summaries) else summaries[k].sampled for k in ids]
+    return scene_reference(np.concatenate([lab_from_rgb(chunk.rgb) for chunk in told] or [np.zeros((0, 3))]))
 
 
 def cameras_of(store: Store, chunks: Sequence[ChunkRow]) -> Sim3:

@@ -121,6 +121,12 @@ class ChunkShapes:
     """Where depth was computed in every third frame: ascending keys of frame and pixel; none of a sensor. (S,)."""
     sample_owner: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
+    stands_for: int = 1
+    """Frames of the recording that one of `frames` stands for: itself, and those after it that were passed over."""
+
+    def seen_for(self, at: int) -> int:
+        """Return in how many frames of the recording an instance (0 to N - 1) is seen, passed over ones included."""
+        return self.stands_for * len(self.frames[at])
 
     def only(self, kept: NDArray[np.bool_]) -> ChunkShapes:
         """Return some of the instances, (N,). Samples of the others still belong to something: they have the numbers
@@ -229,6 +235,17 @@ def chunk_shapes(
     )
 
 
+def read_every(shapes: ChunkShapes, step: int) -> ChunkShapes:
+    """Return the shapes of a chunk of which every `step`-th frame was to be read.
+
+    One stands for less where the chunk was read more densely, as by the gaps between frames in which anything is seen.
+    """
+    if step == 1 or not shapes.frames:
+        return shapes
+    gaps = np.diff(np.unique(np.concatenate(shapes.frames)))
+    return replace(shapes, stands_for=min(step, int(np.median(gaps))) if len(gaps) else step)
+
+
 SAMPLED_FRAMES = 3
 """Every how many frames samples are kept."""
 PIXEL_BITS = 24
@@ -310,7 +327,8 @@ def lies_on(points: Array, target: ChunkShapes) -> NDArray[np.bool_]:
     return found
 
 
-_KEPT_BYTES = 8 << 20
+_KEPT_BYTES = 32 << 20
+"""Those of some 70 chunks with a dozen things: of a place that many sessions saw, all are asked for with each chunk."""
 
 
 @dataclass(frozen=True)

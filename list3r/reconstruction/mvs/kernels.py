@@ -116,6 +116,47 @@ def _add_zncc(reference: Floats, sums: Floats, inside: Floats, radius: int, nois
 
 
 @compiled
+def path_costs(volume: Floats, large: Floats, small: np.float32) -> Floats:
+    """Return the sums of the path costs from both ends of the first axis. Shape (n, m, D).
+
+    `volume` is the cost of D depths at each place, (n, m, D); `large` that of a step of more than one depth from a
+    place to the next, (n - 1, m), and `small` that of a step of one.
+    """
+    length, lines, depths = volume.shape
+    out, nothing = np.empty_like(volume), np.float32(np.inf)
+    path = np.full((lines, depths + 2), nothing, np.float32)
+    for step in range(2 * length):
+        back = step >= length
+        k = 2 * length - 1 - step if back else step
+        begins, gap = k == (length - 1 if back else 0), k if back else k - 1
+        for j in range(lines):
+            own, cost, total = path[j], volume[k, j], out[k, j]
+            if begins:
+                own[1:-1] = cost
+            else:
+                _next_on_path(own, cost, large[gap, j], small)
+            if back:
+                for d in range(depths):
+                    total[d] += own[d + 1]
+            else:
+                total[:] = own[1:-1]
+    return out
+
+
+@compiled
+def _next_on_path(path: Floats, cost: Floats, large: np.float32, small: np.float32) -> None:
+    """Write the costs of paths (D + 2,), which end with infinity on either side, at a next place of costs (D,)."""
+    least = path[1]
+    for d in range(2, len(cost) + 1):
+        least = min(least, path[d])
+    far, left = least + large, path[0]
+    for d in range(len(cost)):
+        here = path[d + 1]
+        best = min(min(here, far), min(left + small, path[d + 2] + small))
+        left, path[d + 1] = here, cost[d] + best - least
+
+
+@compiled
 def fill_holes(
     inverse: Floats, radius: int, least: float, residual: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

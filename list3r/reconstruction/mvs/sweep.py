@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up, stacked
-from list3r.reconstruction.mvs.kernels import zncc_cost
+from list3r.reconstruction.mvs.kernels import path_costs, zncc_cost
 from list3r.reconstruction.mvs.settings import SweepSettings
 
 
@@ -124,12 +124,24 @@ def aggregate(cost: Tensor, gray: Tensor, settings: SweepSettings) -> Tensor:
 
 
 def _paths(volume: Tensor, gray: Tensor, settings: SweepSettings) -> Tensor:
-    """Path costs along the first axis, from both ends at once. Shape (n, m, D)."""
-    length = volume.shape[0]
-    both = torch.stack([volume, volume.flip(0)], dim=1)
+    """Path costs along the first axis, from both ends, summed. Shape (n, m, D)."""
+    if volume.device.type != "cpu":
+        return _paths_of_tensors(volume, gray, settings)
+    large = _larger_steps(gray, settings).numpy()
+    return torch.from_numpy(path_costs(volume.numpy(), large, np.float32(settings.path_small)))
+
+
+def _larger_steps(gray: Tensor, settings: SweepSettings) -> Tensor:
+    """Return what a step of more than one depth costs from each place to the next. Shape (n - 1, m)."""
     change = (gray[1:] - gray[:-1]).abs()
-    large = settings.path_large / (1.0 + change / settings.path_edge)
-    large = torch.stack([large, large.flip(0)], dim=1)[..., None].clamp_min(1.5 * settings.path_small)
+    return (settings.path_large / (1.0 + change / settings.path_edge)).clamp_min(1.5 * settings.path_small)
+
+
+def _paths_of_tensors(volume: Tensor, gray: Tensor, settings: SweepSettings) -> Tensor:
+    """Return the same on an accelerator."""
+    length, large = volume.shape[0], _larger_steps(gray, settings)
+    both = torch.stack([volume, volume.flip(0)], dim=1)
+    large = torch.stack([large, large.flip(0)], dim=1)[..., None]
     out = torch.empty_like(both)
     out[0] = both[0]
     for k in range(1, length):

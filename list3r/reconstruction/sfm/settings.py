@@ -255,7 +255,8 @@ class SfmSettings:
 
     tracks: CornerSettings = field(default_factory=CornerSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
-    mapping: MappingSettings = field(default_factory=MappingSettings)
+    mapping: MappingSettings = field(default_factory=lambda: MappingSettings(settled=1e-4))
+    """Settled maps are as near to the truth and to the pictures as those adjusted on (docs/decisions/0157)."""
     fill: FramePoseSettings = field(default_factory=FramePoseSettings)
     calibration: CameraCalibrationSettings = field(default_factory=CameraCalibrationSettings)
     keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)
