@@ -79,7 +79,7 @@ def test_bits_that_surely_carry_join_their_thing() -> None:
 
 
 def test_what_the_network_doubts_stays_as_it_was() -> None:
-    assert after(scene(), weights(GAP, 0.0, 0.0)) == [0, 1, 2, -1, 3]
+    assert after(scene(), weights(GAP, 0.0, -1.0)) == [0, 1, 2, -1, 3]
 
 
 def test_a_thing_of_less_than_20_cm_has_no_bits() -> None:

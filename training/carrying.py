@@ -149,10 +149,11 @@ def fit_carrying(tables: Sequence[PairTable], settings: CarryFit | None = None) 
     given, truth = torch.from_numpy((x - mean) / std), torch.from_numpy(one)
     nets = [_fitted((given, truth, share), s, seed) for seed in range(s.members)]
     found: dict[str, NDArray[Any]] = {"carry.mean": mean, "carry.std": std}
-    found["carry.net.0.weight"] = torch.cat([n[0].weight for n in nets]).detach().numpy()
-    found["carry.net.0.bias"] = torch.cat([n[0].bias for n in nets]).detach().numpy()
-    found["carry.net.2.weight"] = (torch.cat([n[3].weight for n in nets], dim=1) / s.members).detach().numpy()
-    found["carry.net.2.bias"] = (torch.stack([n[3].bias for n in nets]).mean(dim=0)).detach().numpy()
+    hidden, last = [n[0] for n in nets], [n[3] for n in nets]
+    found["carry.net.0.weight"] = np.concatenate([h.weight.detach().numpy() for h in hidden])
+    found["carry.net.0.bias"] = np.concatenate([h.bias.detach().numpy() for h in hidden])
+    found["carry.net.2.weight"] = np.concatenate([e.weight.detach().numpy() for e in last], axis=1) / s.members
+    found["carry.net.2.bias"] = np.mean([e.bias.detach().numpy() for e in last], axis=0)
     return found
 
 

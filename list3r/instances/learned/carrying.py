@@ -125,12 +125,12 @@ def clusters_of(
     codes, at = np.unique(code, return_inverse=True)
     mass = np.bincount(at, weight[apart])
     mean = np.bincount(at, np.clip(score, -STRONGEST, STRONGEST)[apart] * weight[apart]) / np.maximum(mass, 1e-6)
-    pad = lambda v: np.append(v, np.zeros(bits))  # noqa: E731
+    none = np.zeros(bits)
     return Clusters(
         np.asarray(labels, np.int32),
         total,
-        pad(told.structure),
-        pad(told.whole),
+        np.append(told.structure, none).astype(np.float64),
+        np.append(told.whole, none).astype(np.float64),
         np.concatenate([groups, np.zeros((bits, len(GROUPS)))]),
         (codes, mean),
     )
@@ -195,13 +195,12 @@ class _Place:
         bounds = np.searchsorted(c.labels[order], np.arange(c.count + 1))
         self.size = np.diff(bounds)
         self.low, self.high = np.full((c.count, 3), np.inf), np.full((c.count, 3), -np.inf)
-        self._own, self._sample = [], []
+        self._sample: list[Ints] = []
         rng = np.random.default_rng(0)
         for k in range(c.count):
             rows = order[bounds[k] : bounds[k + 1]]
             if len(rows):
                 self.low[k], self.high[k] = self._points[rows].min(axis=0), self._points[rows].max(axis=0)
-            self._own.append(rows)
             self._sample.append(rows if len(rows) <= MOST_POINTS else rng.choice(rows, MOST_POINTS, replace=False))
         self._alone: dict[int, Float] = {}
         self._trees: dict[int, cKDTree] = {}
@@ -272,7 +271,9 @@ class _Place:
 
     def described(self, found: list[tuple[int, int]], listed: NDArray[np.bool_]) -> CarryPairs:
         """Return the pairs that are near each other, with what the network sees of them."""
-        kept, rows, probes = [], [], []
+        kept: list[tuple[int, int]] = []
+        rows: list[list[float]] = []
+        probes: list[Float] = []
         for t, k in found:
             gap, at = self.tree(t).query(self._points[self._sample[k]])
             nearest = int(np.argmin(gap))
@@ -298,6 +299,7 @@ class _Place:
 
     @staticmethod
     def features() -> int:
+        """Columns of what the network sees."""
         return 2 * (16 + len(GROUPS)) + 19 + 6 + 2
 
     def _between(self, t: int, k: int, gap: Float, way: Float) -> list[float]:
