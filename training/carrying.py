@@ -150,10 +150,12 @@ def fit_carrying(tables: Sequence[PairTable], settings: CarryFit | None = None) 
     nets = [_fitted((given, truth, share), s, seed) for seed in range(s.members)]
     found: dict[str, NDArray[Any]] = {"carry.mean": mean, "carry.std": std}
     hidden, last = [n[0] for n in nets], [n[3] for n in nets]
-    found["carry.net.0.weight"] = np.concatenate([h.weight.detach().numpy() for h in hidden])
-    found["carry.net.0.bias"] = np.concatenate([h.bias.detach().numpy() for h in hidden])
-    found["carry.net.2.weight"] = np.concatenate([e.weight.detach().numpy() for e in last], axis=1) / s.members
-    found["carry.net.2.bias"] = np.mean([e.bias.detach().numpy() for e in last], axis=0)
+    found["carry.net.0.weight"] = np.concatenate([h.get_parameter("weight").detach().numpy() for h in hidden])
+    found["carry.net.0.bias"] = np.concatenate([h.get_parameter("bias").detach().numpy() for h in hidden])
+    found["carry.net.2.weight"] = (
+        np.concatenate([e.get_parameter("weight").detach().numpy() for e in last], axis=1) / s.members
+    )
+    found["carry.net.2.bias"] = np.mean([e.get_parameter("bias").detach().numpy() for e in last], axis=0)
     return found
 
 
@@ -168,7 +170,7 @@ def _fitted(table: tuple[Tensor, Tensor, Tensor], s: CarryFit, seed: int) -> nn.
             group["lr"] = s.rate * 0.5 * (1 + float(np.cos(np.pi * step / s.steps)))
         rows = torch.from_numpy(rng.integers(len(given), size=s.batch))
         out = net(given[rows] + s.noise * torch.randn(len(rows), given.shape[1]))[:, 0]
-        loss = (F.binary_cross_entropy_with_logits(out, truth[rows], reduction="none") * share[rows]).mean()
+        loss: Any = (F.binary_cross_entropy_with_logits(out, truth[rows], reduction="none") * share[rows]).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -275,7 +275,7 @@ class _Place:
         rows: list[list[float]] = []
         probes: list[Float] = []
         for t, k in found:
-            gap, at = self.tree(t).query(self._points[self._sample[k]])
+            gap, at = (np.asarray(v) for v in self.tree(t).query(self._points[self._sample[k]]))
             nearest = int(np.argmin(gap))
             if gap[nearest] > REACH_M:
                 continue
