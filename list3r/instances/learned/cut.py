@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from list3r.instances.learned.agglomeration import STRONGEST, agglomerate
+from list3r.instances.learned.carrying import CARRIES, Borders, CarrySettings, joined_by_carrying
 from list3r.instances.learned.graph import ChunkSurface, PieceGraph, piece_graph
 from list3r.instances.learned.network import Classification, Weights, classify
 from list3r.instances.learned.pieces import Pieces, cut_pieces
@@ -29,6 +30,8 @@ class CutSettings:
     """Mean log odds above which parts become things."""
     hop_m: float = 0.05
     """Longest gap over which voxels of no piece go to the thing that is nearest."""
+    carry: CarrySettings | None = field(default_factory=CarrySettings)
+    """When what carries a thing joins it; None: never."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,13 @@ def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | N
     own = agglomerate(len(graph.nodes), graph.left, graph.right, told.affinity, graph.weight, s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
-    return CloudCut(labels, classify_things(weights, own, graph, told))
+    said = classify_things(weights, own, graph, told)
+    if s.carry is not None and CARRIES in weights:
+        borders = Borders(own[graph.left], own[graph.right], told.affinity, graph.weight)
+        labels = joined_by_carrying(surface, (labels, said), borders, weights, s.carry)
+        left = np.bincount(labels[labels >= 0], minlength=len(said.structure)) > 0
+        return CloudCut(labels, said).only(left)
+    return CloudCut(labels, said)
 
 
 def join_parts(
