@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,8 @@ class CutSettings:
     """Mean log odds above which parts become things."""
     hop_m: float = 0.05
     """Longest gap over which voxels of no piece go to the thing that is nearest."""
-    carry: CarrySettings | None = field(default_factory=CarrySettings)
-    """When what carries a thing joins it; None: never."""
+    carry: CarrySettings | None = None
+    """When what carries a thing joins it; None: never, as relations in whole memories are not settled (0158)."""
 
 
 @dataclass(frozen=True)
