@@ -68,8 +68,7 @@ FLIER_VOXEL_M = 0.02
 """Grain at which points are counted to find those that fly."""
 FLIER_SHARE = 0.15
 """Points of a voxel, over those of the voxel of a usual point of the thing, below which it holds readings that fly.
-Both chosen on seeds 5000 to 5009 and walks 1 to 6 of the house (docs/decisions/0081-boxes-without-fliers.md); 0.05
-finds more in one chunk, but was not tried on relations alone (0161)."""
+Both chosen on seeds 5000 to 5009 and walks 1 to 6 of the house (docs/decisions/0081-boxes-without-fliers.md)."""
 
 
 def without_fliers(points: NDArray[np.float32], unit: float) -> NDArray[np.int64]:

@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from list3r.instances.learned.agglomeration import STRONGEST, agglomerate
-from list3r.instances.learned.carrying import CARRIES, Borders, CarrySettings, joined_by_carrying
 from list3r.instances.learned.graph import ChunkSurface, PieceGraph, piece_graph
 from list3r.instances.learned.network import Classification, Weights, classify
 from list3r.instances.learned.pieces import Pieces, cut_pieces
@@ -30,8 +29,6 @@ class CutSettings:
     """Mean log odds above which parts become things."""
     hop_m: float = 0.05
     """Longest gap over which voxels of no piece go to the thing that is nearest."""
-    carry: CarrySettings | None = None
-    """When what carries a thing joins it; None: never, as relations in whole memories are not settled (0158)."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +52,7 @@ def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | N
     own = agglomerate(len(graph.nodes), graph.left, graph.right, told.affinity, graph.weight, s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
-    said = classify_things(weights, own, graph, told)
-    if s.carry is not None and CARRIES in weights:
-        borders = Borders(own[graph.left], own[graph.right], told.affinity, graph.weight)
-        labels = joined_by_carrying(surface, (labels, said), borders, weights, s.carry)
-        left = np.bincount(labels[labels >= 0], minlength=len(said.structure)) > 0
-        return CloudCut(labels, said).only(left)
-    return CloudCut(labels, said)
+    return CloudCut(labels, classify_things(weights, own, graph, told))
 
 
 def join_parts(
