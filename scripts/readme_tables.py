@@ -69,7 +69,7 @@ def summary() -> str:
                 "long simulated videos with revisits, simulated network",
                 "ATE RMSE after Sim(3), median",
                 ate(fair, "full"),
-                f"VGGT-Long's association {ate(fair, 'vggt-long')}; as corrected since {_corrected_by()}",
+                f"VGGT-Long's association {ate(fair, 'vggt-long')}",
                 _commit("association-fair"),
             ],
             [
@@ -215,9 +215,10 @@ VARIANTS = {
     "ilrd-paper": "loops by `s_loop` alone, as the paper writes it",
     "verified": "loops by frame similarity, verified by geometry, no instance",
     "ilrd": "+ instances rank, object, and register (ILRD)",
-    "iasm": "+ instance-aware support (IASM)",
-    "cwgo-paper": "the same with the paper's weights of edges",
-    "graph": "+ covariances, loops that can be switched off (CWGO)",
+    "iasm-paper": "+ instance-aware support as the paper writes it",
+    "iasm": "+ instance-aware support as builds do it (IASM)",
+    "cwgo-paper": "the row above with the paper's weights of edges",
+    "graph": "IASM + covariances, loops that can be switched off (CWGO)",
     "full": "+ nodes within chunks (full)",
     "full-no-instances": "full, all instance evidence off",
 }
@@ -253,68 +254,24 @@ def fair() -> str:
     return _ate_table(_read("association-fair")["runs"], VARIANTS, "vggt-long")
 
 
-def ranked() -> str:
-    """Return what instances bring in the older kinds of video, before and since s_loop refuses nothing."""
+def worth() -> str:
+    """Return what instances bring in the older kinds of video and in those in which a place looks otherwise."""
     rows = []
-    for name, when in (("association-fair", "before"), ("association-now", "since")):
+    kinds = {"association-fair": "the seven kinds above", "association-returns": "a place looks otherwise"}
+    for name, what in kinds.items():
         runs = {(r["preset"], r["seed"], r["variant"]): r for r in _read(name)["runs"]}
         videos = sorted({key[:2] for key in runs})
         on, off = ([runs[*v, variant] for v in videos] for variant in ("full", "full-no-instances"))
         logs = [math.log(a["ate_sim3_m"] / b["ate_sim3_m"]) for a, b in zip(on, off, strict=True)]
         middle, error = statistics.mean(logs), statistics.stdev(logs) / len(logs) ** 0.5
-        found = [f"{sum(r['true_loops'] for r in rs)} and {sum(r['false_loops'] for r in rs)}" for rs in (on, off)]
         ratio = f"{math.exp(middle):.2f} ({math.exp(middle - error):.2f} to {math.exp(middle + error):.2f})"
+        found = [sum(r["true_loops"] for r in rs) / sum(r["revisits"] for r in rs) for rs in (on, off)]
+        false = [sum(r["false_loops"] for r in rs) for rs in (on, off)]
         better = f"{sum(x < 0 for x in logs)} of {len(videos)}"
-        rows.append([f"{when}, {_commit(name)}", ratio, better, *found])
+        rows.append([what, ratio, better, *(f"{a:.2f}, {b}" for a, b in zip(found, false, strict=True))])
     heads = ["ATE with instances, as a share of that without (one standard error)", "better with them in"]
-    more = ["relations with instances: right, off by more than 0.5 m", "the same without"]
-    return _table(["s_loop refuses candidates that are verified", *heads, *more], rows)
-
-
-def merging() -> str:
-    """Return merging as the paper writes it beside ours."""
-    runs = {(r["preset"], r["variant"]): r for r in _read("association-iasm")["runs"]}
-    presets = list(dict.fromkeys(p for p, _ in runs))
-    names = {"iasm-paper": "as the paper writes it", "iasm": "as builds do it (IASM)"}
-
-    def cell(preset: str, variant: str) -> str:
-        r = runs[preset, variant]
-        return f"{r['ate_sim3_m']:.3f}, {r['false_loops']}"
-
-    rows = [[name, *(cell(p, v) for p in presets)] for v, name in names.items()]
-    return _table(["ATE, m, and relations off by more than 0.5 m", *presets], rows)
-
-
-def _ates(*names: str) -> dict[tuple[str, int, str], float]:
-    """Return the ATE of results by preset, seed and variant."""
-    return {(r["preset"], r["seed"], r["variant"]): r["ate_sim3_m"] for name in names for r in _read(name)["runs"]}
-
-
-def _corrected_by() -> str:
-    """Return by how much VGGT-Long's error changed with the residual of its published code."""
-    before, now = _ates("association-fair", "association-returns"), _ates("association-vggt-long")
-    logs = [math.log(ate / before[key]) for key, ate in now.items() if key[2] == "vggt-long"]
-    return f"x {math.exp(statistics.mean(logs)):.2f} ({len(logs)} videos, geometric mean)"
-
-
-def corrected() -> str:
-    """Return what VGGT-Long's row is with the residual of its published code, beside what it was before."""
-    before = _ates("association-fair", "association-returns")
-    runs = [r for r in _read("association-vggt-long")["runs"] if (r["preset"], r["seed"], r["variant"]) in before]
-    presets = list(dict.fromkeys(r["preset"] for r in runs))
-    rows = []
-    for name, chosen in (*((p, [p]) for p in presets), ("all", presets)):
-        mine = [r for r in runs if r["preset"] in chosen and r["variant"] == "vggt-long"]
-        now, was, full = (
-            [r["ate_sim3_m"] for r in mine],
-            [before[r["preset"], r["seed"], "vggt-long"] for r in mine],
-            [before[r["preset"], r["seed"], "full"] for r in mine],
-        )
-        medians = [statistics.median(x) for x in (now, was, full)]
-        cells = [f"{m:.3f}" for m in medians]
-        rows.append([f"{name} ({len(mine)})", *cells, f"{medians[2] / medians[0]:.2f}"])
-    heads = ["VGGT-Long", "with the residual of before", "`full`", "`full` as a share of VGGT-Long"]
-    return _table(["median ATE of the same videos, m", *heads], rows)
+    more = ["revisits found with instances, relations off by more than 0.5 m", "the same without"]
+    return _table(["geometric mean over videos", *heads, *more], rows)
 
 
 def returns() -> str:
@@ -514,9 +471,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "walks": walks,
     "discovery": discovery,
     "fair": fair,
-    "ranked": ranked,
-    "corrected": corrected,
-    "merging": merging,
+    "worth": worth,
     "returns": returns,
     "registration": registration,
     "changed": changed,
