@@ -136,8 +136,7 @@ def path_costs(volume: Floats, large: Floats, small: np.float32) -> Floats:
             else:
                 _next_on_path(own, cost, large[gap, j], small)
             if back:
-                for d in range(depths):
-                    total[d] += own[d + 1]
+                total += own[1:-1]
             else:
                 total[:] = own[1:-1]
     return out
