@@ -51,7 +51,7 @@ def test_frames_without_a_pose_are_kept_or_counted(tmp_path: Path) -> None:
 
 def test_nothing_is_left_where_nothing_could_be_written(tmp_path: Path) -> None:
     source = write_record3d(tmp_path / "a")
-    with pytest.raises(OptionError, match="choose tum"):
+    with pytest.raises(OptionError, match="choose one of: tum"):
         convert(source, "gaussian", tmp_path / "b")
     with pytest.raises(ExportError, match="does not exist"):
         convert(source, "tum", tmp_path / "no/such")

@@ -51,7 +51,7 @@ def test_ply_settings(room: Store, tmp_path: Path) -> None:
     raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
     assert dict(zip(*np.unique(raw["instance"], return_counts=True), strict=True)) == {2: 50, 3: 50, 4: 50, 5: 50}
     assert tuple(cloud.colors[raw["instance"].ravel() == 5][0][:3]) == (90, 60, 30)
-    with pytest.raises(OptionError, match="instance or rgb"):
+    with pytest.raises(OptionError, match="instance, rgb"):
         PlySettings(color="height")
 
 
