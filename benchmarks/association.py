@@ -306,7 +306,7 @@ class _Truth:
         errors_m = np.array(
             [self._loop_error(store, e) if e.accepted else np.nan for e in loops if e.frames is not None]
         )
-        judged = replace(judged, chunk_labels=_right_is_no_error(judged.chunk_labels, errors_m))
+        judged = replace(judged, chunk_labels=_right_is_no_error(judged.chunk_labels, candidates.chunks, errors_m))
         revisits = score([judged])
         return {
             "posed": len(rows) / self.frames,
@@ -357,11 +357,13 @@ class _Truth:
             return None
 
 
-def _right_is_no_error(labels: NDArray[np.int8], errors_m: Array) -> NDArray[np.int8]:
-    """A pair of chunks that share hardly a view, but whose measured relation is right, counts neither way."""
+def _right_is_no_error(labels: NDArray[np.int8], chunks: NDArray[np.int64], errors_m: Array) -> NDArray[np.int8]:
+    """A pair of chunks that share hardly a view, but of which a measured relation is right, counts neither way."""
     from list3r.evaluation.revisits import FALSE, OPEN
 
-    return np.where((labels == FALSE) & (errors_m <= FALSE_M), np.int8(OPEN), labels)
+    pairs = np.sort(chunks, axis=1)
+    right = {tuple(pair) for pair in pairs[errors_m <= FALSE_M].tolist()}
+    return np.where((labels == FALSE) & [tuple(pair) in right for pair in pairs.tolist()], np.int8(OPEN), labels)
 
 
 def _rigid(S: Any) -> Array:
