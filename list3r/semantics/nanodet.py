@@ -121,7 +121,7 @@ class NanoDet:
         if score.shape[1] != len(self._names):
             raise OptionError(
                 f"--detector {self.name} has {score.shape[1]} classes but {len(self._names)} names; give a file "
-                "with one name a line by --detector-classes"
+                "with one name per line by --detector-classes"
             )
 
 
@@ -135,7 +135,7 @@ def read_class_names(path: Path) -> tuple[str, ...]:
         raise OptionError(f"--detector-classes {path} is not a text file; it must hold one name per line") from None
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
-        raise OptionError(f"--detector-classes {path} is empty; one name a line is needed")
+        raise OptionError(f"--detector-classes {path} is empty; one name per line is needed")
     return names
 
 

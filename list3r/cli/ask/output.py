@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from list3r.queries.relations import Relations
     from list3r.queries.views.camera import PosedCamera
 
-Count = Annotated[int, typer.Option("-k", help="Most answers.")]
+Count = Annotated[int, typer.Option("-k", help="Most answers to return.")]
 MinConfidence = Annotated[
     float | None,
     typer.Option(

@@ -83,8 +83,8 @@ def export(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, a page to
-    read, or a folder: models of COLMAP and nerfstudio, a pack for a language model.
+    """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, an HTML
+    report, or a folder: models of COLMAP and nerfstudio, a pack for a language model.
 
     Example: list3r export house.l3r --to usd --out house.usdc
     """
