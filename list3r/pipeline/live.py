@@ -236,8 +236,10 @@ def _begun(store: Store, feed: Feed, job: Job, options: SourceOptions, watch: Wa
     begun = replace(options, start=0, stop=max(_FIRST_FRAMES, feed.state().count))
     first = replace(job, options=begun, source=feed.folder)
     step = settled_step(store, session, first, watch)
-    told = with_camera(store, session, begun, lambda: estimated_camera(first.frames(), begun, job.settings, watch.look))
-    whole = replace(told, start=options.start, stop=options.stop)
+    known = with_camera(
+        store, session, begun, lambda: estimated_camera(first.frames(), begun, job.settings, watch.look)
+    )
+    whole = replace(known, start=options.start, stop=options.stop)
     chunks = job.settings.chunks.times(step)
     feed.hold(2 * chunks.length - chunks.overlap)
     return LiveSession(store, session, job, feed, whole, step)

@@ -120,7 +120,7 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
 
 
 def _said(camera: SessionCamera) -> str:
-    """What the build that reads the files has to be told, so that its pictures are those that were looked at."""
+    """Options for the build that reads the files, so that it takes the same pictures."""
     values = (("intrinsics", camera.intrinsics), ("distortion", camera.distortion))
     words = [f"--{name} {','.join(f'{v:.5g}' for v in numbers) or 0}" for name, numbers in values]
     return f"the camera was estimated; give the build the same: {' '.join(words)}"

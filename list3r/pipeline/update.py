@@ -78,7 +78,7 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
             add_chunks(store, job, plan, pool, watch)
         _check_posed(store, session, job.info)
     except BaseException:
-        with suppress(MemoryFileError):  # what was wrong first is told; the next update takes it back
+        with suppress(MemoryFileError):  # the first error is reported; the next update takes it back
             if not _begun(store, session):
                 take_back(store, session)
         raise

@@ -22,7 +22,7 @@ from list3r.semantics.detector import Detector
 from list3r.semantics.voting import ThingInFrame, VotingSettings, summed, vote
 
 LOOKS_PER_S = 5.0
-"""Frames of a source looked at in a second: nearer ones show the same view and are told the same."""
+"""Frames of a source looked at in a second: nearer ones show the same view and get the same boxes."""
 Progress = Callable[[int, int], None]
 """Called with (chunks done, chunks in all)."""
 

@@ -27,7 +27,7 @@ def watching(
 ) -> Iterator[Watch]:
     """Show progress in a bar, and notes above it unless they are not wanted.
 
-    Ctrl-C ends the command with what `interrupted` says, which is told whether a chunk was finished.
+    Ctrl-C ends the command with what `interrupted` says, which hears whether a chunk was finished.
     """
     begun = False
     try:

@@ -74,5 +74,5 @@ def save_picture(figure: Figure, path: Path) -> None:
 
 
 def free_scale(scale: str, estimate: Path) -> bool:
-    """Whether the scale of an alignment is free: as told, or by `auto` for a memory of relative scale."""
+    """Whether the scale of an alignment is free: as asked, or by `auto` for a memory of relative scale."""
     return scale == "free" or (scale == "auto" and scale_of(estimate) == "relative")

@@ -61,7 +61,7 @@ def calibrate(
     if known:
         return _of_known(windows, (start, free), chosen, stored_px, _parted(found, stored_px, chosen))
     sigma = _focal_sigma(windows, chosen)
-    said = f"the camera was estimated from the pictures: focal length {_told_px(free, sigma, stored_px)}"
+    said = f"the camera was estimated from the pictures: focal length {_px_text(free, sigma, stored_px)}"
     notes = (f"{said}; distortion k1 {k1:.3f}", *_parted(found, stored_px, chosen))
     return CameraCalibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
 
@@ -87,7 +87,7 @@ def _of_known(
     if abs(np.log(free.fx / start.fx)) > settings.doubted_sigmas * sigma:
         said = (
             f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which suggest about "
-            f"{_told_px(free, sigma, stored_px)}; check --intrinsics, or leave it out"
+            f"{_px_text(free, sigma, stored_px)}; check --intrinsics, or leave it out"
         )
         return CameraCalibration(start, len(windows), free.fx, sigma, (said,))
     _, k1 = _adjust_together(windows, start, False, settings)
@@ -95,7 +95,7 @@ def _of_known(
     return CameraCalibration(lens, len(windows), free.fx, sigma, notes)
 
 
-def _told_px(camera: Camera, sigma: float, stored_px: float) -> str:
+def _px_text(camera: Camera, sigma: float, stored_px: float) -> str:
     return f"{camera.fx * stored_px:.0f} px, give or take {100 * sigma:.0f} %"
 
 
