@@ -32,7 +32,7 @@ from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
 from list3r.pipeline.chunks.calibration import estimated_camera, with_camera
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
-from list3r.pipeline.finishing import FinishingError, finish
+from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.reports import BuildReport, LiveReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -152,11 +152,7 @@ def build_live(
             with store.transaction():
                 store.sessions.put(replace(store.sessions.get(ours.session), frame_count=state.count))
             report = _report(ours, state, started)
-    notes, failure = finish(memory, feed.folder, first, replace(run, detector=None), watch)
-    report = replace(report, notes=(*report.notes, *notes))
-    if failure is not None:
-        raise FinishingError(failure, report)
-    return report
+    return finish(report, memory, feed.folder, first, replace(run, detector=None), watch)
 
 
 @contextmanager

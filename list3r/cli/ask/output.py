@@ -9,8 +9,8 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask.memory import instance_dict
-from list3r.cli.common import note, print_table
-from list3r.cli.terminal import say
+from list3r.cli.common import print_table
+from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,8 +11,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import ProgressBar, progress_bar
-from list3r.cli.common import note
-from list3r.cli.terminal import say
+from list3r.cli.terminal import note, say
 from list3r.pipeline.request import Watch
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, spread
-from list3r.cli.terminal import say
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, spread
+from list3r.cli.terminal import note, say
 from list3r.exporters.registry import FORMATS, find_format
 from list3r.pipeline.request import option
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from list3r.cli.common import note
 from list3r.cli.measure.inputs import scale_of
+from list3r.cli.terminal import note
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -43,13 +43,12 @@ class SmallFrames:
     ) -> SmallFrames:
         """Thin out the depth images; those without depth are not posed."""
         stride = max(1, round(camera.width / width))
-        height, width = -(-camera.height // stride), -(-camera.width // stride)
-        depth = np.zeros((len(depths), height, width), np.float32)
+        small = camera.every(stride)
+        depth = np.zeros((len(depths), small.height, small.width), np.float32)
         for k, image in enumerate(depths):
             if image is not None:
                 depth[k] = image[::stride, ::stride]
         usable = posed & np.array([d is not None for d in depths], bool)
-        small = Camera(width, height, camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
         return SmallFrames(small, depth, T_chunk_cam, usable, stride)
 
 

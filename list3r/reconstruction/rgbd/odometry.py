@@ -139,13 +139,8 @@ class CameraTracker:
             self._features[position] = detect(frame.color, frame.depth, self.camera, self.settings.features)
         return self._features[position]
 
-    def _usable(self, position: int) -> bool:
-        return self.frames[position].depth is not None and bool(
-            self.view(position).known_share >= self.settings.least_known
-        )
-
     def _step(self, position: int) -> None:
-        if not self._usable(position):
+        if self.frames[position].depth is None or self.view(position).known_share < self.settings.least_known:
             return
         mask = self._mover_memory.expect(self._whole_view(position))
         if position in self._known:

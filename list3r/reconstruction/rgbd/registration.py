@@ -264,11 +264,6 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
     return _SurfelPairs.of(model, paired, spread(paired[7], 1e-3))
 
 
-def _geometric(pairs: _SurfelPairs, huber: float) -> NormalEquations:
-    """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
-    return _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, huber)
-
-
 def _geometric_slope(pairs: _SurfelPairs) -> Floats:
     return plane_slopes(pairs.moved, pairs.normals, pairs.inverse_sigma)
 
@@ -285,7 +280,8 @@ def _solid_information(
     weighted = weight[:, None] * pairs.moved
     first, second = skew(weighted.sum(axis=0).astype(np.float64)), (weighted.T @ pairs.moved).astype(np.float64)
     feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
-    information = _geometric(pairs, settings.huber)[0] - settings.normal_noise**2 * feigned
+    information = _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, settings.huber)[0]
+    information -= settings.normal_noise**2 * feigned
     if photometric:
         information += settings.photometric_weight * _photometric(pairs, frame, T, settings.gradient_noise)[0]
     return information
