@@ -221,7 +221,7 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, tr
     from benchmarks.peers.graph_weights import peer_weights
     from benchmarks.peers.paper_loops import paper_loops
     from benchmarks.peers.paper_support import paper_merging
-    from list3r.association.overlap.motion import flag_moving
+    from list3r.association.overlap.motion import flag_dynamic
     from list3r.frames.base import Camera
     from list3r.memory.store.store import Store
     from list3r.pipeline.mapping import add_chunk, finish_session
@@ -241,7 +241,7 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, tr
             if settings.edges.instance_aware and variant != "iasm-paper":
                 height, width = result.image_size
                 camera = Camera(width, height, *result.intrinsics)
-                chunk = replace(result, library=flag_moving(result.samples, result.library, camera))
+                chunk = replace(result, library=flag_dynamic(result.samples, result.library, camera))
             with paper_merging(), paper_loops(), peer_weights():
                 add_chunk(store, session, chunk, joint, settings, library=False)
         if not peer:

@@ -74,8 +74,8 @@ def _write(path: Path, parts: Sequence[Reconstruction]) -> None:
         arrays[f"scale_kind.{k}"] = np.array(part.scale_kind)
         if part.depth_noise is not None:
             arrays[f"depth_noise.{k}"] = np.array(astuple(part.depth_noise))
-        if part.moving is not None:
-            arrays[f"moving.{k}"] = part.moving
+        if part.movers is not None:
+            arrays[f"moving.{k}"] = part.movers
         if part.between is not None:
             arrays |= {f"between_{name}.{k}": value for name, value in vars(part.between).items()}
     unfinished = path.with_suffix(f".{os.getpid()}")
@@ -99,7 +99,7 @@ def read_kept(path: Path) -> Iterator[Reconstruction]:
             if f"between_posed.{k}" in held:
                 names = ("frame_indices", "posed", "T_chunk_cam")
                 made = replace(made, between=PosedOnly(*(held[f"between_{name}.{k}"] for name in names)))
-            yield replace(made, moving=held[f"moving.{k}"]) if f"moving.{k}" in held else made
+            yield replace(made, movers=held[f"moving.{k}"]) if f"moving.{k}" in held else made
 
 
 def _make(name: str, options: ModelOptions) -> Reconstructor:

@@ -86,7 +86,7 @@ class Home:
     def __init__(self, preset: str, seed: int, sensor: bool = False) -> None:
         from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
         from benchmarks.simulation.returns import make_return
-        from list3r.association.overlap.motion import flag_moving
+        from list3r.association.overlap.motion import flag_dynamic
         from list3r.frames.base import Camera
         from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 
@@ -100,7 +100,7 @@ class Home:
         for span in spans:
             made = model.chunk(span)
             height, width = made.image_size
-            flagged = flag_moving(made.samples, made.library, Camera(width, height, *made.intrinsics))
+            flagged = flag_dynamic(made.samples, made.library, Camera(width, height, *made.intrinsics))
             kind = "metric" if sensor else made.scale_kind
             self.runs[span.start >= self.video.cuts[0]].append(replace(made, library=flagged, scale_kind=kind))
         self.second = 0

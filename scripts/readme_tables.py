@@ -32,11 +32,10 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary() -> str:
-    """Return the few rows of README.md: what each part reaches, by which measure, on which data, beside what bounds it,
-    and the commit that was measured."""
+    """Return the rows of README.md: what was measured, the measure, the result, a reference, and the commit."""
     depth, colour, scale = _read("redkitchen"), _read("sfm"), _read("scale")["sizes"][-1]
     worlds, house, own = (_read(n)["mean"] for n in ("discovery", "discovery-house", "simulated"))
-    told = _read("relations")["pooled"]
+    masked = _read("relations")["pooled"]
     fair, returns_ = _read("association-fair")["runs"], _read("association-returns")["runs"]
     kills = _read("safety")["asked"]["kills"]
 
@@ -45,60 +44,60 @@ def summary() -> str:
         return f"{statistics.median(e):.1f} cm (mean {statistics.mean(e):.1f}, worst {max(e):.0f})"
 
     def things(mean: Any) -> str:
-        return f"{mean['recall_0.25']:.2f} found, {mean['precision_0.25']:.2f} right"
+        return f"{mean['recall_0.25']:.2f} recall, {mean['precision_0.25']:.2f} precision"
 
-    boxes = "recall, precision of boxes at IoU 0.25"
+    boxes = "boxes at IoU 0.25"
     return _table(
-        ["", "measure", "reached", "for comparison", "commit"],
+        ["", "measure", "result", "reference", "commit"],
         [
             [
-                "camera, a real kitchen of 1,000 frames, depth sensor",
+                "camera path, real kitchen, 1,000 frames with depth",
                 "ATE RMSE after SE(3)",
                 f"{100 * depth['ate_se3_m']:.1f} cm, {depth['frames_per_second']:.0f} frames/s",
-                "truth itself good to a few cm",
+                "ground truth accurate to a few cm",
                 _commit("redkitchen"),
             ],
             [
-                "the same by colour alone",
+                "camera path, same kitchen, colour only",
                 "ATE RMSE after Sim(3)",
                 f"{100 * colour['list3r']['ate_sim3_m']:.1f} cm, {colour['list3r']['frames_per_s']:.0f} frames/s",
                 f"plain pycolmap {100 * colour['pycolmap']['ate_sim3_m']:.1f} cm",
                 _commit("sfm"),
             ],
             [
-                "long simulated videos with revisits, simulated network",
+                "camera path, long simulated videos with revisits, simulated network",
                 "ATE RMSE after Sim(3), median",
                 ate(fair, "full"),
                 f"VGGT-Long's association {ate(fair, 'vggt-long')}",
                 _commit("association-fair"),
             ],
             [
-                "the same where a place is seen again but looks otherwise",
+                "the same, but places look different when revisited",
                 "ATE RMSE after Sim(3), median",
                 ate(returns_, "full"),
                 f"without instances {ate(returns_, 'full-no-instances')}",
                 _commit("association-returns"),
             ],
-            ["things in homes of our own simulator (whole walks)", boxes, things(own), "", _commit("simulated")],
+            ["instances, simulated homes (whole walks)", boxes, things(own), "", _commit("simulated")],
             [
-                "things in ten left-out worlds of our own simulator (one chunk)",
+                "instances, ten held-out simulated worlds (one chunk)",
                 boxes,
                 things(worlds["learned"]),
                 f"with true masks {things(worlds['true'])}",
                 _commit("discovery"),
             ],
             [
-                "things in a house that others made, rendered (one chunk)",
+                "instances, renderings of a house modelled by others (one chunk)",
                 boxes,
                 things(house["learned"]),
                 f"with true masks {things(house['true'])}",
                 _commit("discovery-house"),
             ],
             [
-                "`on`, in homes of our own simulator",
-                "recall, precision of pairs",
-                f"{own['on_recall']:.2f} found, {own['on_precision']:.2f} right",
-                f"with true masks {told['on']['recall']:.2f}, {told['on']['precision']:.2f}",
+                "`on` relations, simulated homes",
+                "pairs",
+                f"{own['on_recall']:.2f} recall, {own['on_precision']:.2f} precision",
+                f"with true masks {masked['on']['recall']:.2f}, {masked['on']['precision']:.2f}",
                 _commit("simulated"),
             ],
             *(
@@ -118,7 +117,7 @@ def summary() -> str:
                 "",
                 _commit("scale"),
             ],
-            ["killed at random moments", "what was lost", f"nothing in {kills} times", "", _commit("safety")],
+            ["killed at random moments", "data lost", f"none in {kills} runs", "", _commit("safety")],
         ],
     )
 
@@ -131,11 +130,11 @@ def _commit(name: str) -> str:
 
 
 def kitchen() -> str:
-    """Return the table of the red kitchen: colour and depth, and four ways of giving its colour alone."""
+    """Return the table of the red kitchen: colour with depth, and colour alone in four forms."""
     depth, colour = _read("redkitchen"), [_read(f"sfm{kind}") for kind in ("", "-free-focal", "-mp4", "-phone")]
     runs = [r["list3r"] for r in colour]
     plain = [r.get("pycolmap") for r in colour]
-    ways = ("colour, focal length given", "colour, nothing given", "as mp4", "as a phone's clip")
+    ways = ("colour, known focal length", "colour, unknown focal length", "colour, mp4", "colour, phone clip")
     return _table(
         ["7-Scenes red kitchen, 1,000 frames", "colour and depth", *ways],
         [
@@ -144,8 +143,7 @@ def kitchen() -> str:
             ["ATE RMSE after SE(3), m", f"{depth['ate_se3_m']:.3f}", *("" for _ in runs)],
             ["plain pycolmap, every 8th frame, same run", ""]
             + ["" if p is None else f"{p['ate_sim3_m']:.3f}" for p in plain],
-            ["whole program, frames/s", f"{depth['frames_per_second']:.1f}"]
-            + [f"{r['frames_per_s']:.1f}" for r in runs],
+            ["end to end, frames/s", f"{depth['frames_per_second']:.1f}"] + [f"{r['frames_per_s']:.1f}" for r in runs],
             ["peak memory, GB", f"{depth['peak_mb'] / 1000:.1f}", *(f"{r['peak_mb'] / 1000:.1f}" for r in runs)],
             ["instances listed", str(depth["instances"]), *(str(r["instances"]) for r in runs)],
         ],
@@ -169,32 +167,32 @@ def walks() -> str:
         [
             "recall, precision; means over walks",
             "colour and depth, 6 walks",
-            "the same by the rules, before",
-            "colour alone, 3 walks",
+            "the same, former discovery by rules",
+            "colour only, 3 walks",
         ],
         [
             ["instances at box IoU 0.25", boxes(depth, "0.25"), boxes(rules, "0.25"), boxes(colour, "0.25", "box_")],
             ["instances at box IoU 0.50", boxes(depth, "0.50"), boxes(rules, "0.50"), boxes(colour, "0.50", "box_")],
             ["instances at mask IoU 0.25", "", "", boxes(colour, "0.25", "mask_")],
-            ["duplicates, merged pairs a walk", counts(depth), counts(rules), ""],
+            ["duplicates, merged pairs per walk", counts(depth), counts(rules), ""],
             both("`on`", "on"),
             both("`next_to`", "next_to"),
             both("`in`", "in"),
-            ["camera (ATE RMSE), m", *(f"{m['ate_se3_m']:.3f}" for m in (depth, rules)), f"{colour['ate_sim3_m']:.3f}"],
+            ["camera ATE RMSE, m", *(f"{m['ate_se3_m']:.3f}" for m in (depth, rules)), f"{colour['ate_sim3_m']:.3f}"],
         ],
     )
 
 
 def discovery() -> str:
-    """Return the table of discovery: rules, the learned one and true masks on worlds left out and in a house; and what
-    is lost where the networks see less.
+    """Return the table of discovery on held-out worlds and a house by rules, by networks and by true masks, and the
+    ablation of the networks' inputs.
     """
-    methods = {"geometric": "rules (taken out since)", "learned": "learned (default)", "true": "true masks"}
+    methods = {"geometric": "rules (removed since)", "learned": "learned (default)", "true": "true masks"}
     places = {
-        "discovery": "10 left-out worlds",
-        "discovery-fitted": "6 left-out rooms with what is built in",
-        "discovery-house": "a house",
-        "discovery-ablation": "the 10 worlds, networks trained on 40 rooms",
+        "discovery": "10 held-out worlds",
+        "discovery-fitted": "6 held-out rooms with built-in furniture",
+        "discovery-house": "house modelled by others",
+        "discovery-ablation": "the 10 worlds, trained on only 40 rooms",
     }
     keys = {"boxes at IoU 0.25": ("", "0.25"), "at 0.5": ("", "0.5"), "masks at 0.25": ("mask_", "0.25")}
     keys["masks at 0.5"] = ("mask_", "0.5")
@@ -212,15 +210,15 @@ def discovery() -> str:
 VARIANTS = {
     "vggt-long": "VGGT-Long and Pi-Long, their own loop selection, alignment and optimiser; no cut detection",
     "vggt-long-cuts": "the same, cuts given (as in all rows below)",
-    "ilrd-paper": "loops by `s_loop` alone, as the paper writes it",
-    "verified": "loops by frame similarity, verified by geometry, no instance",
-    "ilrd": "+ instances rank, object, and register (ILRD)",
-    "iasm-paper": "+ instance-aware support as the paper writes it",
-    "iasm": "+ instance-aware support as builds do it (IASM)",
-    "cwgo-paper": "the row above with the paper's weights of edges",
-    "graph": "IASM + covariances, loops that can be switched off (CWGO)",
+    "ilrd-paper": "loops by `s_loop` alone, as in the paper",
+    "verified": "loops by frame similarity, verified by geometry, no instances",
+    "ilrd": "+ instances rank, veto and register (ILRD)",
+    "iasm-paper": "+ instance-aware support as in the paper",
+    "iasm": "+ instance-aware support as in builds (IASM)",
+    "cwgo-paper": "the row above with the paper's edge weights",
+    "graph": "IASM + covariances and switchable loops (CWGO)",
     "full": "+ nodes within chunks (full)",
-    "full-no-instances": "full, all instance evidence off",
+    "full-no-instances": "full, without any instance evidence",
 }
 
 
@@ -257,7 +255,7 @@ def fair() -> str:
 def worth() -> str:
     """Return what instances bring in the older kinds of video and in those in which a place looks otherwise."""
     rows = []
-    kinds = {"association-fair": "the seven kinds above", "association-returns": "a place looks otherwise"}
+    kinds = {"association-fair": "the seven kinds above", "association-returns": "places that look different"}
     for name, what in kinds.items():
         runs = {(r["preset"], r["seed"], r["variant"]): r for r in _read(name)["runs"]}
         videos = sorted({key[:2] for key in runs})
@@ -269,8 +267,8 @@ def worth() -> str:
         false = [sum(r["false_loops"] for r in rs) for rs in (on, off)]
         better = f"{sum(x < 0 for x in logs)} of {len(videos)}"
         rows.append([what, ratio, better, *(f"{a:.2f}, {b}" for a, b in zip(found, false, strict=True))])
-    heads = ["ATE with instances, as a share of that without (one standard error)", "better with them in"]
-    more = ["revisits found with instances, relations off by more than 0.5 m", "the same without"]
+    heads = ["ATE with instances / ATE without (one standard error)", "better with instances"]
+    more = ["with instances: revisits found, relations off by more than 0.5 m", "without"]
     return _table(["geometric mean over videos", *heads, *more], rows)
 
 
@@ -283,8 +281,8 @@ def registration() -> str:
     """Return the table of registration by things alone."""
     names = {
         "opposite": "from the opposite end of the room",
-        "opposite-sensor": "the same, geometry of a depth sensor",
-        "moved": "half of the things moved, other light",
+        "opposite-sensor": "the same, depth sensor",
+        "moved": "half of the things moved, different light",
         "alike": "one of three rooms that look alike",
     }
     rows = []
@@ -294,8 +292,8 @@ def registration() -> str:
         cells = [f"{t['joined']} of {t['homes']}", str(t["joined_wrongly"]), f"{t['believed']}, {wrong}"]
         off = f"{t['median_m']:.2f}, {t['median_deg']:.1f}"
         rows.append([name, *cells, off, f"{t['within_0.1_m_and_3_deg']} of {t['joined']}"])
-    heads = ["homes joined", "with a wrong relation", "relations believed, wrong ones", "median m, degrees"]
-    return _table(["by things alone, homes that nothing was tuned on", *heads, "within 0.1 m and 3 degrees"], rows)
+    heads = ["homes joined", "with a wrong relation", "accepted relations, wrong ones", "median error (m, degrees)"]
+    return _table(["registration by things alone, held-out homes", *heads, "within 0.1 m and 3 degrees"], rows)
 
 
 def changed() -> str:
@@ -312,7 +310,7 @@ def changed() -> str:
             f"{other_homes['placed']} of {other_homes['sessions']}",
         ),
         (
-            "keyframes alone, at true poses",
+            "keyframes only, true poses",
             alone,
             alone["placed_right"],
             alone["placed_wrong"],
@@ -321,16 +319,16 @@ def changed() -> str:
     ):
         off = f"{1000 * t['median_off_m']:.1f} and {1000 * t['worst_off_m']:.1f} mm"
         rows.append([name, f"{placed} of {t['homes']}", str(wrong), str(t["homes"] - placed - wrong), off, others])
-    heads = ["placed within 0.1 m and 3 degrees", "in a wrong place", "left apart", "off, median and worst"]
-    return _table(["homes that nothing was chosen on", *heads, "placed in another home"], rows)
+    heads = ["placed within 0.1 m and 3 degrees", "placed wrongly", "left apart", "error, median and worst"]
+    return _table(["held-out homes", *heads, "placed in another home"], rows)
 
 
 def alignment() -> str:
     """Return the table of the alignment of whole point maps."""
     single, double, builds = _read("alignment"), _read("alignment-double"), _read("alignment-builds")
     ways = [
-        ("as builds do it, seeds 1 to 8", builds, "builds"),
-        ("ours on whole point maps, which builds do not use, seeds 1 to 8", single, "ours"),
+        ("ours as in builds, seeds 1 to 8", builds, "builds"),
+        ("ours on whole point maps (not in builds), seeds 1 to 8", single, "ours"),
         ("VGGT-Long's, seeds 1 to 8", single, "vggt_long"),
         ("ours on whole point maps, seeds 1 and 2", double, "ours"),
         ("VGGT-Long's in double precision, seeds 1 and 2", double, "vggt_long_double"),
@@ -344,7 +342,7 @@ def alignment() -> str:
             cells.append(f"{position}, {m['rotation_error_deg']:.4f}, {m['scale_error_percent']:.4f} %")
         rows.append([name, *cells, f"{held['outliers_on_both_sides'][way]['seconds']['mean']:.2f} s"])
     heads = ["outliers on both sides", "on one side", "processor time"]
-    return _table(["error of position, rotation (degrees), scale; mean", *heads], rows)
+    return _table(["mean error: position, rotation (degrees), scale", *heads], rows)
 
 
 def changes() -> str:
@@ -352,25 +350,27 @@ def changes() -> str:
     kinds = ("moved", "removed", "added", "all")
     runs = {
         **dict(_sessions()),
-        "three walks twice through a house that others made": _read("changes-elsewhere-house")["total"]["learned"],
+        "three walks, each filmed twice, in a house modelled by others": _read("changes-elsewhere-house")["total"][
+            "learned"
+        ],
     }
     rows = [[name, *(f"{total[k]['f1']:.2f}" for k in kinds)] for name, total in runs.items()]
     return _table(["F1 of change records", *kinds], rows)
 
 
 def _sessions() -> list[tuple[str, Any]]:
-    """Return what was measured of second sessions in homes of our own simulator: where, and the sums."""
+    """Return the totals of second sessions in simulated homes, by place."""
     before = _read("sessions-rules")["total seeds 311 to 320"]
-    out = [("homes 311 to 320 of our simulator, discovery by rules that are gone", before)]
+    out = [("simulated homes 311 to 320, former discovery by rules", before)]
     if (RESULTS / "sessions.json").exists():
         result = _read("sessions")
         seeds = [row["seed"] for row in result["seeds"]]
-        out.insert(0, (f"homes {min(seeds)} to {max(seeds)} of our simulator", result["total"]))
+        out.insert(0, (f"simulated homes {min(seeds)} to {max(seeds)}", result["total"]))
     return out
 
 
 def relations() -> str:
-    """Return the table of relations where the masks are told."""
+    """Return the table of relations with true masks."""
     pooled = _read("relations")["pooled"]
     names = {
         "on": "`on`",
@@ -385,7 +385,7 @@ def relations() -> str:
 
 
 def pack() -> str:
-    """Return which share of questions the text for a language model answers, by memory and budget."""
+    """Return the share of questions that the text for a language model answers, by memory and budget."""
     rows = _read("prompt_pack")["rows"]
     budgets = sorted({r["budget"] for r in rows})
     found = {(r["memory"], r["instances"]): {} for r in rows}
@@ -416,7 +416,7 @@ def exports() -> str:
 
 
 def receivers() -> str:
-    """Return what others read in the exports of whole memories."""
+    """Return what other programs read in the exports of whole memories."""
     names = {"redkitchen": "redkitchen, 1,000 frames", "home-1": "the demo", "home-7": "`demo --seed 7`"}
     rows = []
     for r in _read("receivers")["rows"]:
@@ -424,7 +424,7 @@ def receivers() -> str:
         said = f"{r['usd_core_errors']}, {'none' if r['nvidia_sound'] else 'some'}"
         counts = [f"{r['instances']}, {r['relations']}", agree, f"{r['box_mm']:.3f} mm"]
         rows.append([names[r["memory"]], *counts, said, f"{r['props_passed']} of {r['props']}"])
-    heads = ["instances, relations", "formats agree", "boxes off by", "usd-core, NVIDIA say", "props that pass"]
+    heads = ["instances, relations", "formats that agree", "box error", "errors: usd-core, NVIDIA", "props that pass"]
     return _table(["memory", *heads], rows)
 
 
@@ -432,36 +432,36 @@ def catalogue() -> str:
     """Return what questions to a catalogue in PostgreSQL cost as it grows."""
     stages = _read("catalog")["stages"]
     rows = [
-        ["a memory of 1,000 goes in", "put of 1000"],
+        ["add a memory of 1,000", "put of 1000"],
         *([n, n] for n in stages[0] if "," in n and "recall" not in n),
     ]
     lines = []
-    for told, name in rows:
+    for title, name in rows:
         cells = [s[name] for s in stages]
         cost = [f"{c['client_cpu_ms'] + c['server_cpu_ms']:.3g}" for c in cells]
         lines.append(
-            [told, *(f"{cpu} ({c['p10_ms']:.3g}, {c['p50_ms']:.3g})" for cpu, c in zip(cost, cells, strict=True))]
+            [title, *(f"{cpu} ({c['p10_ms']:.3g}, {c['p50_ms']:.3g})" for cpu, c in zip(cost, cells, strict=True))]
         )
-    for told in ("similar, all", "similar, all, even", "similar, all, lone"):
-        lines.append([f"recall@10 of {told}", *(f"{s[f'recall@10, {told}']:.3f}" for s in stages)])
+    for name in ("similar, all", "similar, all, even", "similar, all, lone"):
+        lines.append([f"recall@10 of {name}", *(f"{s[f'recall@10, {name}']:.3f}" for s in stages)])
     lines.append(["GB on disk", *(f"{s['bytes']['all'] / 1e9:.2f}" for s in stages)])
     load = [s["loaded"] for s in stages]
     spent = [1e3 * (x["client_cpu_s"] + x["server_cpu_s"]) / x["memories"] for x in load]
-    lines.append(["a memory in a load of many, ms", *(f"{x:.0f}" for x in spent)])
+    lines.append(["bulk load, ms per memory", *(f"{x:.0f}" for x in spent)])
     heads = [f"{s['memories']} memories, {s['instances']:,} instances" for s in stages]
-    return _table(["ms of processor time, client and server (wall p10, p50)", *heads], lines)
+    return _table(["ms of processor time, client + server (wall p10, p50)", *heads], lines)
 
 
 def batches() -> str:
     """Return the runs of the benchmark of batches."""
     rows = []
     for name, r in _read("batch")["runs"].items():
-        equal = "the others are compared with these" if name == "one-process" else "equal" if r["equal"] else "differ"
+        equal = "reference" if name == "one-process" else "equal" if r["equal"] else "differ"
         ended, lost = f"{r['worker_kills']}, {r['driver_kills']}", r["attempts"].get("lost", 0)
         twice = f"{len(r['built_twice'])}, {len(r['rewritten'])}"
         done = f"{r['attempts']['done']}, {lost}, {r['attempts'].get('failed', 0)}"
         rows.append([name, str(r["files"]), equal, ended, done, twice, f"{r['cpu_s']:.0f}", f"{r['seconds']:.0f}"])
-    heads = ["files", "bytes", "ended workers, drivers", "attempts done, lost, failed", "built twice, written twice"]
+    heads = ["files", "bytes", "killed workers, drivers", "attempts done, lost, failed", "built twice, written twice"]
     return _table(["run", *heads, "processor s", "wall s"], rows)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.association.overlap.motion import flag_moving, motion_track, seen_through
+from list3r.association.overlap.motion import flag_dynamic, motion_track, seen_through
 from list3r.frames.base import Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.library import build_library
@@ -22,7 +22,7 @@ GAUGE = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.4])
 
 
 def moving(samples: FrameSamples) -> list[int]:
-    flagged = flag_moving(samples, library_of(samples), CAMERA)
+    flagged = flag_dynamic(samples, library_of(samples), CAMERA)
     return [i.local_id for i in flagged.instances if i.dynamic]
 
 
@@ -40,7 +40,7 @@ def test_what_moves_is_found_also_along_the_ray(speed: tuple[float, float, float
 def test_its_track_is_where_it_was() -> None:
     thing = Thing(MOVER, (-0.5, 0.2, 2.0), (0.2, 0.4), (0.05, 0.0, 0.0))
     samples = film((*BOXES, thing), GAUGE, noise=0.005)
-    flagged = flag_moving(samples, library_of(samples), CAMERA)
+    flagged = flag_dynamic(samples, library_of(samples), CAMERA)
     motion = next(i.motion for i in flagged.instances if i.local_id == MOVER)
     assert motion is not None
     true = GAUGE.apply(np.array(thing.center) + motion.frames[:, None] * np.array(thing.speed))
@@ -77,7 +77,7 @@ def test_what_something_else_hides_does_not_move() -> None:
 
 def test_nothing_to_judge_is_no_mover() -> None:
     empty = LocalLibrary((), np.zeros((0, 2), np.int32), "test@1/4")
-    assert flag_moving(FrameSamples.empty(), empty, CAMERA).instances == ()
+    assert flag_dynamic(FrameSamples.empty(), empty, CAMERA).instances == ()
     samples = film(noise=0.005)
     library = library_of(samples)
     assert not seen_through(FrameSamples.empty(), library, CAMERA).any()
@@ -92,7 +92,7 @@ def test_what_is_flagged_stays_flagged() -> None:
     samples = film()
     library = library_of(samples)
     known = replace(library, instances=tuple(replace(i, dynamic=i.local_id == BOX) for i in library.instances))
-    flagged = flag_moving(samples, known, CAMERA)
+    flagged = flag_dynamic(samples, known, CAMERA)
     assert [i.local_id for i in flagged.instances if i.dynamic] == [BOX]
     assert next(i for i in flagged.instances if i.dynamic).motion is not None
 
@@ -109,6 +109,6 @@ def test_real_rooms_in_which_nothing_moves_have_no_mover(name: str) -> None:
     frames = [f for f in source.read(0, 24) if isinstance(f, Frame)]
     reconstruction = RgbdReconstructor(poses="estimate")(frames, camera)
     library = build_library(frames, reconstruction)
-    flagged = flag_moving(frame_samples(reconstruction, library), library, reconstruction.camera)
+    flagged = flag_dynamic(frame_samples(reconstruction, library), library, reconstruction.camera)
     assert len(flagged.instances) >= 3
     assert not any(i.dynamic for i in flagged.instances)

@@ -13,8 +13,8 @@ from list3r.instances.library import build_library
 from list3r.memory.masks import decode_mask
 from list3r.memory.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.motion.moving import SmallFrames, find_moving
-from list3r.reconstruction.motion.moving_tracks import follow_movers
+from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
+from list3r.reconstruction.motion.tracks import track_movers
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from tests.rgbd_scenes import BOXES, CAMERA, render, walk
 
@@ -86,9 +86,9 @@ def test_masks_lie_on_the_mover() -> None:
 
 def test_what_stays_does_not_see_the_mover() -> None:
     _, result, library = built("walker", "given")
-    assert result.moving is not None
+    assert result.movers is not None
     for position in range(0, FRAMES, 7):
-        taken = np.kron(result.moving[position] > 0, np.ones((2, 2), bool))[: CAMERA.height, : CAMERA.width]
+        taken = np.kron(result.movers[position] > 0, np.ones((2, 2), bool))[: CAMERA.height, : CAMERA.width]
         assert not result.depth[position][taken].any()
         assert not result.confidence[position][taken].any()
     low, high = np.array([-1.3, -0.7, 1.1]), np.array([1.0, 0.15, 1.45])
@@ -106,7 +106,7 @@ def test_the_other_things_are_those_of_the_still_room() -> None:
 @pytest.mark.parametrize("poses", ["given", "estimate"])
 def test_nothing_moves_in_a_still_room(poses: str) -> None:
     _, result, library = built("none", poses)
-    assert result.moving is None
+    assert result.movers is None
     assert not any(i.dynamic for i in library.instances)
 
 
@@ -128,14 +128,14 @@ def test_degenerate_chunks_have_no_movers() -> None:
     poses = np.array([f.T_source_cam for f in frames])
     depths = [f.depth for f in frames]
     for posed in (np.zeros(3, bool), np.array([True, False, False])):
-        assert find_moving(SmallFrames.of(depths, poses, posed, CAMERA, 160)) is None
+        assert movers_in_free_space(SmallFrames.of(depths, poses, posed, CAMERA, 160)) is None
     nothing = SmallFrames.of([None] * 3, poses, np.ones(3, bool), CAMERA, 160)
-    assert find_moving(nothing) is None
+    assert movers_in_free_space(nothing) is None
     empty = SmallFrames.of([np.zeros_like(frames[0].depth)] * 3, poses, np.ones(3, bool), CAMERA, 160)
-    assert find_moving(empty, {0: np.ones((120, 160), bool)}) is None
+    assert movers_in_free_space(empty, {0: np.ones((120, 160), bool)}) is None
     masks = np.zeros(empty.depth.shape, bool)
     masks[0, 10:20, 10:20] = True
-    assert follow_movers(masks, [f.color for f in frames], np.arange(3.0), empty) is None
+    assert track_movers(masks, [f.color for f in frames], np.arange(3.0), empty) is None
 
 
 def test_a_blob_that_goes_nowhere_is_no_mover() -> None:
@@ -145,10 +145,10 @@ def test_a_blob_that_goes_nowhere_is_no_mover() -> None:
     bare = [render(T, boxes=BOXES[:2], index=k).depth for k, T in enumerate(poses)]
     masks = np.array([b[::2, ::2] - f.depth[::2, ::2] > 0.15 for b, f in zip(bare, frames, strict=True)])
     assert masks.any(axis=(1, 2)).all()
-    assert follow_movers(masks, [f.color for f in frames], np.arange(12) / 30, small) is None
+    assert track_movers(masks, [f.color for f in frames], np.arange(12) / 30, small) is None
 
 
 def test_frames_without_depth_are_left_out() -> None:
     frames = [replace(f, depth=None) if f.index in (5, 20) else f for f in filmed(walker)]
     result = RgbdReconstructor(poses="given")(frames, CAMERA)
-    assert result.moving is not None and not result.moving[[5, 20]].any()
+    assert result.movers is not None and not result.movers[[5, 20]].any()

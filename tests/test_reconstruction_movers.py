@@ -10,8 +10,8 @@ import pytest
 
 from list3r.frames.base import Frame
 from list3r.reconstruction.base import SensorNoise
-from list3r.reconstruction.motion.movers import surfaces
-from list3r.reconstruction.motion.settings import MoverSettings
+from list3r.reconstruction.motion.residuals import surfaces
+from list3r.reconstruction.motion.settings import ResidualMoverSettings
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from list3r.reconstruction.rgbd.view import make_view
 from tests.rgbd_scenes import CAMERA, frames_along, pose_errors, walk
@@ -55,7 +55,7 @@ def test_surfaces_are_parted_by_steps_of_depth() -> None:
     frame, noise = carried(frames_along(walk(1))[0], place(0)), SensorNoise()
     assert frame.depth is not None
     view = make_view(frame.color, frame.depth, CAMERA.shrunk(160), noise)
-    boards = [m for m in surfaces(view, MoverSettings(), noise) if m[view.depth.shape[0] // 2, 80]]
+    boards = [m for m in surfaces(view, ResidualMoverSettings(), noise) if m[view.depth.shape[0] // 2, 80]]
     assert len(boards) == 1
     assert abs(float(boards[0].mean()) - 0.2) < 0.05
     assert float(np.median(view.depth[boards[0] & (view.depth > 0)])) == pytest.approx(1.17, abs=0.05)

@@ -112,7 +112,7 @@ def test_a_question_that_is_piped_starts_without_the_drawing(named: Path) -> Non
 WORK = """
 import sys, time
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import note
+from list3r.cli.terminal import note
 with progress_bar("building", "frames") as bar:
     bar.show(0, 1000)
     time.sleep(0.4)

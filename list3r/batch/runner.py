@@ -6,9 +6,8 @@ import hashlib
 import tempfile
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from list3r.batch.engines.base import Engine
 from list3r.batch.ledger import Ledger, TaskRow
@@ -16,6 +15,7 @@ from list3r.batch.storage import Output, is_remote
 from list3r.batch.tasks import BatchTask
 from list3r.batch.work import BatchJob, Outcome, run_task
 from list3r.memory.errors import OptionError
+from list3r.memory.records import JsonFields
 
 STATE = "batch.sqlite"
 """Name of the manifest beside the memories."""
@@ -73,7 +73,7 @@ class BatchSettings:
 
 
 @dataclass(frozen=True)
-class BatchReport:
+class BatchReport(JsonFields):
     """What a run of a batch did."""
 
     done: int
@@ -82,10 +82,6 @@ class BatchReport:
     """Of them, by this run."""
     failed: int
     tasks: list[TaskRow] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
 
 OnOutcome = Callable[[Outcome, int, int], None]

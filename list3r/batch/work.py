@@ -137,7 +137,7 @@ def _worked(job: BatchJob, work: Path, before: Path | None) -> BuildReport | Upd
     known = _finished(work, before)
     if known is not None and task.run.scale_anchor is None and task.run.detector is None:
         return known
-    if known is not None:  # it cannot be told whether its scale and its names are in it
+    if known is not None:  # whether its scale and its names are in it is not known
         remove_memory(work)
     if before is not None and not work.exists():
         part = work.with_suffix(".part")

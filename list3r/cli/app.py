@@ -20,7 +20,7 @@ import typer
 import typer.core
 
 from list3r.cli.answer import print_error, wants_json
-from list3r.cli.terminal import OutputError, flush, mute, prepare_streams, say, tell
+from list3r.cli.terminal import OutputError, flush, mute, note, prepare_streams, say
 from list3r.memory.address_space import BUILD_MB, check_address_space
 from list3r.memory.errors import List3rError, naming_extras
 
@@ -161,7 +161,7 @@ def run(arguments: list[str]) -> int:
     except List3rError as error:
         return _unwritten(error) if isinstance(error, OutputError) else failures.fail(type(error).__name__, str(error))
     except (KeyboardInterrupt, typer.Abort):
-        tell("", "interrupted")
+        note("", "interrupted")
         return 1
     except (SystemExit, BrokenPipeError) as stop:
         if not isinstance(stop, BrokenPipeError) and not isinstance(stop.__context__, BrokenPipeError):
@@ -182,7 +182,7 @@ class _Failures:
 
     def fail(self, kind: str, message: str) -> int:
         """Say what is wrong with the input; exit status 2."""
-        tell(f"error: {message}")
+        note(f"error: {message}")
         if self.json:
             print_error(kind, message, 2)
         return 2
@@ -211,7 +211,7 @@ class _Failures:
         context = error.ctx  # type: ignore[attr-defined]
         message = error.format_message()  # type: ignore[attr-defined]
         if not message or message.startswith("Usage:"):
-            tell(*(message or context.get_help()).splitlines())
+            note(*(message or context.get_help()).splitlines())
             return 2
         path = context.command_path if context is not None else "list3r"
         if (name := message.removeprefix("No such command '").rstrip("'.")) in FORMATS:
@@ -221,7 +221,7 @@ class _Failures:
 
 def _unwritten(error: OutputError) -> int:
     mute()
-    tell(f"error: {error}")
+    note(f"error: {error}")
     return 1
 
 

@@ -1,4 +1,4 @@
-"""How far a long piece of work is: told on a terminal, kept quiet elsewhere."""
+"""Progress of long work: shown on a terminal, silent elsewhere."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 
 import typer
 
-from list3r.cli.terminal import draws, say, tell, write
+from list3r.cli.terminal import draws, say, write
 from list3r.memory.description.printable import shown
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ _DRAWN_ROWS = 200
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
     """Left-aligned columns under a header; a word where there are no rows. A short table on a terminal is drawn."""
-    shown_rows = [[_cell(v) for v in row] for row in rows]
+    shown_rows = [[f"{v:.3f}" if isinstance(v, float) else shown(v) for v in row] for row in rows]
     if not shown_rows:
         say("nothing found")
         return
@@ -185,12 +185,3 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def note(*lines: str) -> None:
-    """Lines for people, on standard error; work goes on where nobody listens any more."""
-    tell(*lines)
-
-
-def _cell(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else shown(value)

@@ -45,7 +45,7 @@ def flush() -> None:
         raise OutputError(f"{_FULL} ({error.strerror}); what was asked for is done") from error
 
 
-def tell(*lines: object) -> None:
+def note(*lines: object) -> None:
     """Print lines on standard error; where nobody listens, or nothing fits any more, that is no failure."""
     with contextlib.suppress(OSError):
         sys.stderr.write("".join(f"{shown(line)}\n" for line in lines))

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from list3r.memory.errors import OptionError
+from list3r.memory.records import JsonFields
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CloudErrors:
+class CloudErrors(JsonFields):
     """How a cloud differs from the truth, both in one frame of reference and in metres."""
 
     accuracy_cm: float
@@ -34,10 +35,6 @@ class CloudErrors:
     """Share of the truth's points within the threshold of the estimate."""
     f_score: float
     """Harmonic mean of the two (Knapitsch et al., "Tanks and temples", 2017)."""
-
-    def as_dict(self) -> dict[str, float | None]:
-        """Return plain numbers for JSON."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

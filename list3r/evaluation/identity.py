@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import OptionError
+from list3r.memory.records import JsonFields
 
 Labels = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class IdentityErrors:
+class IdentityErrors(JsonFields):
     """Ids that true objects carry over time."""
 
     frames: int
@@ -27,10 +28,6 @@ class IdentityErrors:
     """Times that an object's id is another one than when it was covered last (CLEAR MOT's mismatches)."""
     several_ids: dict[int, tuple[int, ...]]
     """Objects that carried more than one id, with the ids in the order in which they came."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return asdict(self)
 
 
 def evaluate_identities(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +11,13 @@ from scipy.optimize import linear_sum_assignment
 
 from list3r.evaluation.boxes import box_overlaps
 from list3r.memory.geometry import OrientedBox
+from list3r.memory.records import JsonFields
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class InstanceErrors:
+class InstanceErrors(JsonFields):
     """Detection of objects at one threshold of box IoU."""
 
     iou: float
@@ -42,10 +42,6 @@ class InstanceErrors:
     """Pairs of true objects that are mostly covered by one and the same estimated object."""
     matches: tuple[tuple[int, int, float], ...]
     """(row of the truth, row of the estimate, IoU)."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return asdict(self)
 
 
 def match_boxes(iou: Array, threshold: float) -> list[tuple[int, int]]:

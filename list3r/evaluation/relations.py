@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+
+from list3r.memory.records import JsonFields
 
 Triple = tuple[int, str, int]
 
@@ -23,7 +24,7 @@ class PredicateErrors:
 
 
 @dataclass(frozen=True)
-class RelationErrors:
+class RelationErrors(JsonFields):
     """Relations over matched objects: what is said of an object that is no true one counts neither way."""
 
     total: PredicateErrors
@@ -32,10 +33,6 @@ class RelationErrors:
     """Claimed, in the ids of the truth, but not true."""
     missed: tuple[Triple, ...]
     """True but not claimed."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return asdict(self)
 
 
 def evaluate_relations(

@@ -8,15 +8,14 @@ frame pairs is, different when all of its frame pairs are. Chunks that follow on
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.evaluation.covisibility import Covisibility
 from list3r.memory.errors import OptionError
-from list3r.memory.records import Edge
+from list3r.memory.records import Edge, JsonFields
 
 Array = NDArray[np.float64]
 TRUE, FALSE, OPEN = 1, 0, -1
@@ -123,7 +122,7 @@ class Ranking:
 
 
 @dataclass(frozen=True)
-class RevisitScores:
+class RevisitScores(JsonFields):
     """Revisits found against those that there are."""
 
     settings: RevisitTruthSettings
@@ -140,10 +139,6 @@ class RevisitScores:
     """Accepted between chunks that see different places throughout: chunk u, chunk v, frame in u, frame in v."""
     missed: tuple[tuple[int, int], ...]
     """True pairs of chunks that no accepted candidate joins."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return asdict(self)
 
 
 def judge(

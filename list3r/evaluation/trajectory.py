@@ -7,9 +7,8 @@ SLAM systems", 2012): poses are associated by time, the alignment is Umeyama's o
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import DegenerateError, OptionError, SourceError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation, rotation_from_quat_wxyz, rotation_log, umeyama
+from list3r.memory.records import JsonFields
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ class Coverage:
 
 
 @dataclass(frozen=True)
-class TrajectoryErrors:
+class TrajectoryErrors(JsonFields):
     """How far an estimated trajectory is from the truth."""
 
     pairs: int
@@ -125,10 +125,6 @@ class TrajectoryErrors:
     rpe_rotation_deg: Statistics
     """Angle of the relative error."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return asdict(self)
-
 
 def read_tum(path: str | Path) -> Trajectory:
     """Read `time_s tx ty tz qx qy qz qw` lines; `#` starts a comment; spaces, tabs or commas between numbers.
@@ -140,7 +136,8 @@ def read_tum(path: str | Path) -> Trajectory:
     try:
         lines = read_file(path, MAX_TEXT_BYTES).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"cannot read the trajectory {path}: {_reason(error)}") from error
+        reason = error.strerror or str(error) if isinstance(error, OSError) else "it is not a text file"
+        raise SourceError(f"cannot read the trajectory {path}: {reason}") from error
     for number, line in enumerate(lines, 1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if words:
@@ -153,10 +150,6 @@ def read_tum(path: str | Path) -> Trajectory:
     poses[:, :3, :3] = rotation_from_quat_wxyz(table[:, [7, 4, 5, 6]])
     poses[:, :3, 3] = table[:, 1:4]
     return Trajectory(table[:, 0], poses)
-
-
-def _reason(error: Exception) -> str:
-    return error.strerror or str(error) if isinstance(error, OSError) else "it is not a text file"
 
 
 def _tum_row(words: list[str], where: str) -> list[float]:

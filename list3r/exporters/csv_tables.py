@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from list3r.exporters.output import part_path, write_together
-from list3r.exporters.tables import COLUMNS, Table, Value, rows_of
+from list3r.exporters.tables import COLUMNS, Table, rows_of
 from list3r.memory.store.store import Store
 
 
@@ -21,11 +21,8 @@ def write_csv(store: Store, path: str | Path) -> tuple[Path, ...]:
         with to.open("w", encoding="utf-8", newline="") as file:
             out = csv.writer(file, lineterminator="\n")
             out.writerow(COLUMNS[table])
-            out.writerows([_cell(value) for value in row] for row in rows_of(store, table))
+            rows = rows_of(store, table)
+            out.writerows([str(v).lower() if isinstance(v, bool) else v for v in row] for row in rows)
 
     tables: dict[Path, Table] = {Path(path): "instances", part_path(Path(path), "relations"): "relations"}
     return write_together(tables.items(), write)
-
-
-def _cell(value: Value) -> Value:
-    return str(value).lower() if isinstance(value, bool) else value

@@ -59,7 +59,12 @@ def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = Non
 def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
     scene = trimesh.Scene(base_frame="scene")
     scene.graph.update("world", "scene", matrix=T_GLTF_WORLD)
-    scene.metadata.update(_scene_facts(store, component))
+    scene.metadata |= {
+        "list3r_units": units(store),
+        "list3r_metric": store.facts.scale_kind or "relative",
+        "list3r_gravity": store.facts.gravity,
+        "list3r_component": component.id,
+    }
     for instance in component.instances:
         limit = settings.points_per_structure if instance.structure else settings.points_per_instance
         name = f"instance_{instance.id}"
@@ -74,8 +79,9 @@ def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
             _add(scene, cloud, f"{name}_points", node, instance)
         if has_box(instance) and not instance.structure:
             _add(scene, _wire_box(instance), f"{name}_box", node, instance)
-    if not scene.geometry:
-        _add_nothing(scene)
+    if not scene.geometry:  # trimesh writes no glTF without any: one invisible point at the origin
+        nothing = trimesh.PointCloud(np.zeros((1, 3)), colors=np.zeros((1, 4), np.uint8))
+        scene.add_geometry(nothing, node_name="empty", geom_name="empty")
     return bytes(scene.export(file_type="glb", unitize_normals=False, tree_postprocessor=_say_what_buffers_hold))
 
 
@@ -87,16 +93,15 @@ def _say_what_buffers_hold(tree: dict[str, Any]) -> None:
 
 
 def _add(scene: trimesh.Scene, geometry: Any, name: str, parent: str, instance: Instance) -> None:
-    geometry.metadata.update(_facts(instance))
+    geometry.metadata |= {
+        "id": instance.id,
+        "label": instance.label or "",
+        "description": instance.description,
+        "confidence": round(float(instance.confidence), 4),
+        "state": instance.state,
+        "structure": instance.structure or "",
+    }
     scene.add_geometry(geometry, node_name=name, geom_name=name, parent_node_name=parent)
-
-
-def _add_nothing(scene: trimesh.Scene) -> None:
-    """Add an invisible point: glTF of trimesh needs one geometry, and an empty memory gives one invisible point at the
-    origin."""
-    scene.add_geometry(
-        trimesh.PointCloud(np.zeros((1, 3)), colors=np.zeros((1, 4), np.uint8)), node_name="empty", geom_name="empty"
-    )
 
 
 def _wire_box(instance: Instance) -> trimesh.path.Path3D:
@@ -109,23 +114,3 @@ def _wire_box(instance: Instance) -> trimesh.path.Path3D:
 
 def _color(instance: Instance) -> Color:
     return (structure_color if instance.structure else instance_color)(instance.id)
-
-
-def _facts(instance: Instance) -> dict[str, Any]:
-    return {
-        "id": instance.id,
-        "label": instance.label or "",
-        "description": instance.description,
-        "confidence": round(float(instance.confidence), 4),
-        "state": instance.state,
-        "structure": instance.structure or "",
-    }
-
-
-def _scene_facts(store: Store, component: Component) -> dict[str, Any]:
-    return {
-        "list3r_units": units(store),
-        "list3r_metric": (store.facts.scale_kind or "relative"),
-        "list3r_gravity": store.facts.gravity,
-        "list3r_component": component.id,
-    }

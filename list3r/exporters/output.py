@@ -123,7 +123,7 @@ def check_target(path: Path) -> None:
             raise ExportError(f"{path} is a folder; name a file in it")
         if path.exists() and not path.is_file():
             raise ExportError(f"{path} is not a regular file; name another one")
-        if path.is_file() and _is_database(path):
+        if is_database(path):
             raise ExportError(f"{path} is a memory file or another SQLite database; name another file for the export")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise ExportError(f"the folder {path.parent} is not writable; choose another one or change its permissions")
@@ -131,7 +131,10 @@ def check_target(path: Path) -> None:
         raise ExportError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def _is_database(path: Path) -> bool:
+def is_database(path: Path) -> bool:
+    """Return whether a path is a memory or another SQLite file."""
+    if not path.is_file():
+        return False
     try:
         with path.open("rb") as file:
             return file.read(16) == b"SQLite format 3\x00"

@@ -34,7 +34,8 @@ def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
 
     path = Path(path)
     with replacing(path) as temporary:
-        log = rr.RecordingStream("list3r", recording_id=_recording_id(store), send_properties=False)
+        name = f"{store.path.stem}-{store.ids.largest()}"
+        log = rr.RecordingStream("list3r", recording_id=name, send_properties=False)
         log.save(temporary)
         log.log("about", rr.TextDocument(f"{store.path.name}, lengths in {units(store)}"), static=True)
         for component in read_components(store):
@@ -50,10 +51,6 @@ def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
         log.flush()
         log.disconnect()
     return (path,)
-
-
-def _recording_id(store: Store) -> str:
-    return f"{store.path.stem}-{store.ids.largest()}"
 
 
 def _groups(instances: Sequence[Instance]) -> dict[str, Sequence[Instance]]:

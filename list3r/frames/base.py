@@ -45,6 +45,11 @@ class Camera:
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
         return Camera(width, height, self.fx * x, self.fy * y, cx, cy, self.distortion, self.fisheye)
 
+    def every(self, stride: int) -> Camera:
+        """Return the camera of its pictures with every `stride`-th pixel kept, from the first."""
+        height, width = -(-self.height // stride), -(-self.width // stride)
+        return Camera(width, height, self.fx / stride, self.fy / stride, self.cx / stride, self.cy / stride)
+
     def shrunk(self, width: int) -> Camera:
         """Return the pinhole camera of its pictures at most `width` px wide, of the same shape."""
         return self.pinhole().shrunk_lens(width)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from list3r.frames.base import BadFrame, Frame, FrameSource
+from list3r.frames.base import BadFrame, FrameSource
 from list3r.frames.options import SourceOptions
 from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import check_bad_share, open_source, require_camera
 from list3r.frames.writers.base import MakeWriter, SequenceWriter
 from list3r.memory.errors import ExportError, SourceError, check_choice
+from list3r.memory.records import JsonFields
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ LAYOUTS: dict[str, OutputLayout] = {
 
 
 @dataclass(frozen=True)
-class Converted:
+class Converted(JsonFields):
     """What was written."""
 
     layout: str
@@ -56,10 +56,6 @@ class Converted:
     """Frames that could not be decoded."""
     notes: tuple[str, ...]
     """What the layout does not hold, one sentence each."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return asdict(self)
 
 
 def convert(
@@ -129,7 +125,7 @@ def _write(
         writer.add(frame)
         written, with_depth = written + 1, with_depth + (frame.depth is not None)
         posed += frame.T_source_cam is not None
-        far += _reaches(frame, how.most_depth_m)
+        far += frame.depth is not None and bool(frame.depth.max(initial=0.0) > how.most_depth_m)
     check_bad_share(bad, count, reason)
     if not written:
         raise SourceError(f"{opened.info.path} has no frame with a pose, which {layout} needs; use tum, colmap or r3d")
@@ -142,7 +138,3 @@ def _write(
     if far:
         notes.append(f"depth beyond {how.most_depth_m:g} m does not fit into {layout}: unknown in {far} frames")
     return Converted(layout, str(target), written, with_depth * how.depth, posed, bad, tuple(notes))
-
-
-def _reaches(frame: Frame, most_m: float) -> bool:
-    return frame.depth is not None and bool(frame.depth.max(initial=0.0) > most_m)

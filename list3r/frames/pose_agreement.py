@@ -52,7 +52,7 @@ class AgreementSettings:
     spread: float = 0.25
     """Six of ten matches must agree on one factor within this share."""
     relief: float = 0.08
-    """Deviation of the logarithms of depth from which on it can be told whether they rise or fall together."""
+    """Least deviation of the logarithms of depth at which a correlation means something."""
     good: float = 0.75
     """Another convention is meant where at least this share agrees in it,"""
     gain: float = 0.2

@@ -160,7 +160,7 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     videos = sorted(p.name for p in root.iterdir() if p.suffix.lower() in _VIDEO_ENDINGS)
     if videos:
         raise SourceError(f"{root} is a folder with the video {videos[0]} in it; give the video: {root / videos[0]}")
-    if pictures := _pictures_to_convert(root):
+    if pictures := next((p.name for p in sorted(root.iterdir()) if p.suffix.lower() in _OTHER_PICTURES), None):
         raise SourceError(
             f"{root} holds pictures like {pictures}, which cannot be read here; convert them to JPEG or PNG"
         )
@@ -186,11 +186,6 @@ def _check_nothing_ignored(root: Path, kind: str, options: SourceOptions) -> Non
         found = find(root, options)
         if found is not None and found.files:
             raise SourceError(f"{root} is of the kind {other}, and {kind} would ignore its depth or poses; use {other}")
-
-
-def _pictures_to_convert(root: Path) -> str | None:
-    """Return a picture in the folder of a kind that cannot be read, None where there is none."""
-    return next((p.name for p in sorted(root.iterdir()) if p.suffix.lower() in _OTHER_PICTURES), None)
 
 
 def _open_file(path: Path, options: SourceOptions) -> FrameSource:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from list3r.importers.up_axis import up_axis_notes
 from list3r.memory.errors import MemoryFileError, OptionError, check_choice
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.rules import ConsolidationSettings
-from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.records import ChunkResult, FrameSamples, JsonFields, LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.file import taken
 from list3r.memory.store.store import Store
@@ -29,7 +28,7 @@ _SURE = 0.98
 
 
 @dataclass(frozen=True)
-class ImportReport:
+class ImportReport(JsonFields):
     """What was imported."""
 
     format: str
@@ -42,10 +41,6 @@ class ImportReport:
     ids: dict[str, int]
     """Instance by the map's own name of the thing."""
     notes: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return asdict(self)
 
 
 def import_map(path: str | Path, memory: str | Path, *, kind: str = "auto", up: str = "z") -> ImportReport:

@@ -93,9 +93,8 @@ def write_support(
     pictures = {k.frame_index: k.jpeg for k in keyframes if k.jpeg}
     frames = np.unique(support.frame)
     shown = [f for f in frames.tolist() if f in pictures] or frames.tolist()
-    said = [
-        (int((support.removed & here).sum()), int((support.kept & here).sum())) for here in _in_frames(measured, shown)
-    ]
+    masks = [support.frame == frame for frame in shown]
+    said = [(int((support.removed & m).sum()), int((support.kept & m).sum())) for m in masks]
     frame = shown[max(range(len(shown)), key=said.__getitem__)] if shown else -1
     color = _decoded(pictures[frame]) if frame in pictures else None
     if color is None or color.shape[:2] != (camera.height, camera.width):
@@ -130,10 +129,6 @@ def draw_support(frame_color: NDArray[np.uint8], measured: MeasuredEdge, frame: 
     for line, text in enumerate((f"{edge.kind} {edge.u}-{edge.v}, frame {frame}: {verdict}", edge.reason)):
         cv2.putText(strip, text, (6, 17 + 19 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([row, strip])
-
-
-def _in_frames(measured: MeasuredEdge, frames: Iterable[int]) -> Iterable[NDArray[np.bool_]]:
-    return (measured.support.frame == frame for frame in frames)
 
 
 def _dots(

@@ -1,4 +1,4 @@
-"""What the local instance library can be told. Lengths are metres; a chunk without scale is measured by its depth."""
+"""Settings of the local instance library. Lengths are metres; a chunk without scale is measured by its depth."""
 
 from __future__ import annotations
 

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox, Sim3
+
+
+class JsonFields:
+    """A dataclass that a command reports."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return its fields for JSON."""
+        return asdict(cast(Any, self))
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,7 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
     except ImportError:
         raise OptionError("downloading weights needs a package: pip install 'list3r[models]'") from None
     name, wanted = weights.repository, revision or weights.revision
-    if not _is_known(constants.ENDPOINT):  # told at once; the package would try for half a minute
+    if not _is_known(constants.ENDPOINT):  # refused at once; the package would try for half a minute
         raise OptionError(f"{name}@{wanted} cannot be fetched: {NO_NETWORK.format(name=name)}")
     why = ""
     try:

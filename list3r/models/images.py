@@ -48,7 +48,7 @@ def sam_input(model: str, size: int) -> InputShape:
 def normalised(
     pictures: torch.Tensor, mean: Sequence[float] = IMAGENET_MEAN, std: Sequence[float] = IMAGENET_STD
 ) -> torch.Tensor:
-    """Pictures (..., 3, h, w) in [0, 1], each channel shifted and scaled; as for DINOv2 unless told otherwise."""
+    """Pictures (..., 3, h, w) in [0, 1], each channel shifted and scaled; by default as for DINOv2."""
     return (pictures - pictures.new_tensor(mean).view(3, 1, 1)) / pictures.new_tensor(std).view(3, 1, 1)
 
 

@@ -7,7 +7,6 @@ frames -> chunks -> reconstruction + local instance library        (any process,
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from list3r.memory.address_space import BUILD_MB, check_address_space
 from list3r.memory.errors import TrackingError
 from list3r.memory.records import ChunkResult
 from list3r.memory.store.store import Store
-from list3r.pipeline.finishing import FinishingError, finish
+from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import BuildReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -61,11 +60,7 @@ def build(
         with threadpool_limits(1):
             finish_session(target.store, session, job.settings.association, job.settings.carving)
         report = build_report(target.store, plan, started)
-    notes, failure = finish(memory, source, job.options, run, watch)
-    report = replace(report, notes=(*report.notes, *notes))
-    if failure is not None:
-        raise FinishingError(failure, report)
-    return report
+    return finish(report, memory, source, job.options, run, watch)
 
 
 def _keep(target: Target, part: ChunkResult) -> None:

@@ -212,13 +212,13 @@ def _reads_files(name: str) -> bool:
 
 def _terms(selection: ModelSelection, chosen: Mapping[str, str]) -> list[str]:
     """Return the licences that a user of the models should know of."""
-    told = []
+    found = []
     for option, card in selection.cards():
         where = chosen.get(option.removeprefix("--"))
         text = terms(card, None if where is None else find_weights(card, where.split("@")[0]))
         if text:
-            told.append(f"{text}; see `list3r models list`")
-    return told
+            found.append(f"{text}; see `list3r models list`")
+    return found
 
 
 def _cut(settings: BuildSettings, length: int | None, overlap: int | None) -> ChunkSettings:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import List3rError, OptionError
@@ -14,7 +15,10 @@ from list3r.pipeline.request import Progress, RunOptions, Watch
 from list3r.semantics.detection import DetectReport, detect, open_sources
 
 if TYPE_CHECKING:
+    from list3r.pipeline.reports import BuildReport, UpdateReport
     from list3r.semantics.nanodet import NanoDet
+
+R = TypeVar("R", bound="BuildReport | UpdateReport")
 
 
 class FinishingError(List3rError):
@@ -46,11 +50,9 @@ def check_run(run: RunOptions) -> None:
         raise OptionError(f"--detector-classes {run.detector_classes} needs a detector: --detector FILE")
 
 
-def finish(
-    memory: Path, source: str | Path, options: SourceOptions, run: RunOptions, watch: Watch
-) -> tuple[tuple[str, ...], List3rError | None]:
-    """Anchor the scale and name things where that is asked for; return notes for the report, and what went wrong."""
-    notes: list[str] = []
+def finish(report: R, memory: Path, source: str | Path, options: SourceOptions, run: RunOptions, watch: Watch) -> R:
+    """Anchor the scale and name things if asked to; return the report with notes. Raises `FinishingError` with it."""
+    notes = [*report.notes]
     failure: List3rError | None = None
     try:
         if run.scale_anchor is not None:
@@ -65,7 +67,10 @@ def finish(
             notes.append(f"{seen.detector} named {len(seen.labels)} things")
     except List3rError as error:
         failure = failure or error
-    return tuple(notes), failure
+    report = replace(report, notes=tuple(notes))
+    if failure is not None:
+        raise FinishingError(failure, report)
+    return report
 
 
 def anchor_scale(memory: Path, anchor: str, author: str | None = None) -> EditReport:

@@ -32,7 +32,7 @@ from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
 from list3r.pipeline.chunks.calibration import estimated_camera, with_camera
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
-from list3r.pipeline.finishing import FinishingError, finish
+from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.reports import BuildReport, LiveReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -152,11 +152,7 @@ def build_live(
             with store.transaction():
                 store.sessions.put(replace(store.sessions.get(ours.session), frame_count=state.count))
             report = _report(ours, state, started)
-    notes, failure = finish(memory, feed.folder, first, replace(run, detector=None), watch)
-    report = replace(report, notes=(*report.notes, *notes))
-    if failure is not None:
-        raise FinishingError(failure, report)
-    return report
+    return finish(report, memory, feed.folder, first, replace(run, detector=None), watch)
 
 
 @contextmanager
@@ -236,8 +232,10 @@ def _begun(store: Store, feed: Feed, job: Job, options: SourceOptions, watch: Wa
     begun = replace(options, start=0, stop=max(_FIRST_FRAMES, feed.state().count))
     first = replace(job, options=begun, source=feed.folder)
     step = settled_step(store, session, first, watch)
-    told = with_camera(store, session, begun, lambda: estimated_camera(first.frames(), begun, job.settings, watch.look))
-    whole = replace(told, start=options.start, stop=options.stop)
+    known = with_camera(
+        store, session, begun, lambda: estimated_camera(first.frames(), begun, job.settings, watch.look)
+    )
+    whole = replace(known, start=options.start, stop=options.stop)
     chunks = job.settings.chunks.times(step)
     feed.hold(2 * chunks.length - chunks.overlap)
     return LiveSession(store, session, job, feed, whole, step)

@@ -56,9 +56,9 @@ def add_chunk(
         named = {i.local_id: votes_of_names(i.names) for i in result.library.instances if i.names}
         if named:
             put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named, fresh=True)
-        told = {i.local_id: votes_of_probabilities(i.named) for i in result.library.instances if i.named}
-        if told:
-            put_votes(store, chunk_id, OWN_NAMES, told, fresh=True)
+        probable = {i.local_id: votes_of_probabilities(i.named) for i in result.library.instances if i.named}
+        if probable:
+            put_votes(store, chunk_id, OWN_NAMES, probable, fresh=True)
         given = poses_given(store, session_id)
         if given:
             store.edges.add(_edge_of_given_poses(store, session_id))

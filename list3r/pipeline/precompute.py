@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.source import check_bad_share, open_source
 from list3r.memory.address_space import BUILD_MB, check_address_space
 from list3r.memory.errors import OptionError, TrackingError
-from list3r.memory.records import SessionCamera
+from list3r.memory.records import JsonFields, SessionCamera
 from list3r.pipeline.chunks.calibration import estimated_camera, stated_camera
 from list3r.pipeline.chunks.chunk import ChunkTask, reconstruct
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -36,7 +36,7 @@ from list3r.reconstruction.registry import entry
 
 
 @dataclass(frozen=True)
-class PrecomputeReport:
+class PrecomputeReport(JsonFields):
     """What was written."""
 
     files: int
@@ -44,10 +44,6 @@ class PrecomputeReport:
     posed: int
     bytes: int
     notes: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def precompute(
@@ -120,7 +116,7 @@ def _begin(out: Path, settings: BuildSettings, info: SourceInfo, force: bool) ->
 
 
 def _said(camera: SessionCamera) -> str:
-    """What the build that reads the files has to be told, so that its pictures are those that were looked at."""
+    """Options for the build that reads the files, so that it takes the same pictures."""
     values = (("intrinsics", camera.intrinsics), ("distortion", camera.distortion))
     words = [f"--{name} {','.join(f'{v:.5g}' for v in numbers) or 0}" for name, numbers in values]
     return f"the camera was estimated; give the build the same: {' '.join(words)}"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 
 from list3r.association.revisits.session_ties import HELD
-from list3r.memory.records import Edge
+from list3r.memory.records import Edge, JsonFields
 from list3r.memory.store.store import Store
 from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
 
@@ -34,7 +34,7 @@ class LiveReport:
 
 
 @dataclass(frozen=True)
-class BuildReport:
+class BuildReport(JsonFields):
     """What a build did."""
 
     frames: int
@@ -60,13 +60,9 @@ class BuildReport:
     live: LiveReport | None = None
     """Of a source that grew while it was built."""
 
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
-class UpdateReport:
+class UpdateReport(JsonFields):
     """What an update did."""
 
     session: int
@@ -88,10 +84,6 @@ class UpdateReport:
     frames_per_second: float
     resumed_chunks: int
     notes: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def build_report(store: Store, plan: Plan, started: float) -> BuildReport:

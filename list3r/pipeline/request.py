@@ -123,7 +123,8 @@ class RunOptions:
         ),
     )
     workers: int | None = field(
-        default=None, metadata=option("Worker processes; 0: work in this process; default: one a core, at most 4.", "N")
+        default=None,
+        metadata=option("Worker processes; 0: work in this process; default: one per core, at most 4.", "N"),
     )
     engine: str = field(
         default="local",
@@ -148,7 +149,7 @@ class RunOptions:
     )
     detector_classes: Path | None = field(
         default=None,
-        metadata=option("The detector's classes, one name a line; default: the 80 classes of COCO.", "FILE"),
+        metadata=option("The detector's classes, one name per line; default: the 80 classes of COCO.", "FILE"),
     )
     live: bool = field(
         default=False,

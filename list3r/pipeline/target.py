@@ -55,7 +55,7 @@ def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume
         raise MemoryFileError(f"{path} is a device or pipe, not a regular file; name another file for the memory")
     if path.exists() and path.stat().st_size == 0:
         path.unlink()
-    aside = _aside(path)
+    aside = path.with_name(f"{path.name}.replaced")  # the old memory until a camera is placed in the new one
     if not path.exists():
         if not _is_memory(aside):
             return Target(Store.create(path), fresh=True)
@@ -102,11 +102,6 @@ def _replacing(path: Path, aside: Path) -> Target:
 def _holds_something(store: Store) -> bool:
     """Whether the camera of any frame is placed."""
     return any(f.state == "posed" for f in store.frames.all())
-
-
-def _aside(path: Path) -> Path:
-    """Where `--force` keeps the old memory until a camera is placed in the new one."""
-    return path.with_name(f"{path.name}.replaced")
 
 
 def _identity(path: Path) -> tuple[int, ...] | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -18,7 +17,7 @@ from list3r.frames.source import SourceOptions
 from list3r.memory.address_space import BUILD_MB, check_address_space
 from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
 from list3r.memory.store.store import Store
-from list3r.pipeline.finishing import FinishingError, finish
+from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import UpdateReport, update_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
@@ -61,16 +60,12 @@ def update(
         session = _session(store, job)
         plan = _added(store, session, job, watch)
         report = update_report(store, plan, started)
-    notes, failure = finish(memory, source, job.options, run, watch)
-    report = replace(report, notes=(*report.notes, *notes))
-    if failure is not None:
-        raise FinishingError(failure, report)
-    return report
+    return finish(report, memory, source, job.options, run, watch)
 
 
 def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     """Add the chunks of a session and derive the library, unless that was all done when an update was interrupted."""
-    if _complete(store, session):
+    if any(s.session_id == session and s.state == "complete" for s in store.sessions.all()):
         return plan_session(store, session, job, watch)
     try:
         with chunk_pool(job) as pool:
@@ -78,7 +73,7 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
             add_chunks(store, job, plan, pool, watch)
         _check_posed(store, session, job.info)
     except BaseException:
-        with suppress(MemoryFileError):  # what was wrong first is told; the next update takes it back
+        with suppress(MemoryFileError):  # the first error is reported; the next update takes it back
             if not _begun(store, session):
                 take_back(store, session)
         raise
@@ -90,10 +85,6 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
 def _begun(store: Store, session: int) -> bool:
     """Whether the camera of any frame of a session is placed."""
     return any(f.state == "posed" for f in store.frames.all(session))
-
-
-def _complete(store: Store, session: int) -> bool:
-    return any(s.session_id == session and s.state == "complete" for s in store.sessions.all())
 
 
 def _check_posed(store: Store, session: int, info: SourceInfo) -> None:

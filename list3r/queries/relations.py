@@ -52,7 +52,7 @@ def relations(
 ) -> Relations:
     """Return the relations that match what is given, the surest first. Subject and object are ids, aliases, or words.
 
-    With a `viewpoint` the four of `viewpoint.VIEWPOINT` are told as well (or alone, where one is the predicate); where
+    With a `viewpoint` the four of `viewpoint.VIEWPOINT` are answered as well (or alone, if one is the predicate); if
     neither subject nor object is given, of things that the memory calls near each other. `between` needs `object` and
     `other`. In the answer `state` is unknown where the question cannot be answered: a vertical predicate, or the view
     from a point or a thing, without gravity. Raises `OptionError` for a predicate that does not exist or arguments that

@@ -101,7 +101,7 @@ class Reconstruction:
     """metric or relative."""
     keyframes: NDArray[np.int64]
     """Positions (into F) of the keyframes, ascending. Shape (K,)."""
-    moving: NDArray[np.uint8] | None = None
+    movers: NDArray[np.uint8] | None = None
     """Number of the thing that moves of its own at every n-th pixel, from 1, and 0 for what stays; None where the model
     looks for none or nothing moves. Depth and confidence are 0 there. Shape (F, h, w)."""
     depth_noise: DepthNoise | None = None

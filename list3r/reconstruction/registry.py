@@ -15,7 +15,7 @@ __all__ = ["MODELS", "ModelOptions", "make_reconstructor"]
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """What every reconstruction model is told."""
+    """What every reconstruction model is given."""
 
     poses: str = "estimate"
     """given, prior or estimate."""
@@ -42,7 +42,7 @@ class ModelEntry:
     needs_depth: bool = False
     """Works on RGB-D only."""
     needs_camera: bool = False
-    """Must be told the intrinsics; the others find the focal length themselves."""
+    """Needs the intrinsics; the others find the focal length themselves."""
     calibration: str = ""
     """Module that estimates an unknown camera before the chunks, by `calibrate(source, settings)`."""
     thins: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,19 +16,19 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import OptionError
 from list3r.memory.library.labels import LabelSettings, apply_labels, put_votes
 from list3r.memory.masks import decode_mask
-from list3r.memory.records import ChunkRow, MaskTrack, Votes
+from list3r.memory.records import ChunkRow, JsonFields, MaskTrack, Votes
 from list3r.memory.store.store import Store
 from list3r.semantics.detector import Detector
 from list3r.semantics.voting import ThingInFrame, VotingSettings, summed, vote
 
 LOOKS_PER_S = 5.0
-"""Frames of a source looked at in a second: nearer ones show the same view and are told the same."""
+"""Frames of a source looked at in a second: nearer ones show the same view and get the same boxes."""
 Progress = Callable[[int, int], None]
 """Called with (chunks done, chunks in all)."""
 
 
 @dataclass(frozen=True)
-class DetectReport:
+class DetectReport(JsonFields):
     """What a detector saw."""
 
     detector: str
@@ -38,10 +38,6 @@ class DetectReport:
     """Of any score, also those that are too unsure to name anything by themselves."""
     labels: dict[int, str]
     """What things are called now by detectors, by id."""
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def detect(

@@ -63,9 +63,8 @@ class NanoDet:
         """Find things in an RGB picture. Shape (H, W, 3)."""
         height, width = color.shape[:2]
         scale = self._side / max(height, width)
-        small = cv2.resize(
-            color, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=_kind(scale)
-        )
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        small = cv2.resize(color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         boxes, scores, classes = self._decode(np.asarray(small))
         boxes = boxes * np.array([width / small.shape[1], height / small.shape[0]] * 2, np.float32)
         boxes = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)
@@ -121,7 +120,7 @@ class NanoDet:
         if score.shape[1] != len(self._names):
             raise OptionError(
                 f"--detector {self.name} has {score.shape[1]} classes but {len(self._names)} names; give a file "
-                "with one name a line by --detector-classes"
+                "with one name per line by --detector-classes"
             )
 
 
@@ -135,7 +134,7 @@ def read_class_names(path: Path) -> tuple[str, ...]:
         raise OptionError(f"--detector-classes {path} is not a text file; it must hold one name per line") from None
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
-        raise OptionError(f"--detector-classes {path} is empty; one name a line is needed")
+        raise OptionError(f"--detector-classes {path} is empty; one name per line is needed")
     return names
 
 
@@ -159,10 +158,6 @@ def overlaps(box: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDArray[np
     areas = np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1)
     own = float(np.prod(np.clip(box[2:] - box[:2], 0, None)))
     return np.asarray(shared / np.maximum(areas + own - shared, 1e-9), np.float32)
-
-
-def _kind(scale: float) -> int:
-    return cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
 
 
 def _trained_side(param: Path) -> int:

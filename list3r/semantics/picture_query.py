@@ -24,7 +24,7 @@ class PictureQuery:
     space: str
     """The embedding space of the memory, `model@revision/dim`."""
     vector: NDArray[np.float32]
-    """Shape (D,), or (n,) where only the first n numbers can be told."""
+    """Shape (D,), or (n,) where only the first n numbers are known."""
     part: int | None
     """How many numbers of a vector are compared; None for all."""
 

@@ -44,7 +44,7 @@ class Panel:
             self._edits()
         self._view()
 
-    # ------------------------------------------------------------------ what is told
+    # ------------------------------------------------------------------ messages
 
     def tell(self, text: str, picture: NDArray[np.uint8] | None) -> None:
         """Say what is selected."""

@@ -97,7 +97,7 @@ def in_one_frame(edge: Edge) -> bool:
 
 
 def better_edge(by_points: Edge | None, by_cameras: Edge | None) -> Edge | None:
-    """Return the edge by cameras where there is one, with what the points told; else that by points."""
+    """Return the edge by cameras where there is one, with the scores of the points; else that by points."""
     if by_cameras is None or by_points is None:
         return by_cameras or by_points
     scores = {**by_points.scores, **by_cameras.scores, "spread": by_points.scores["spread"]}

@@ -76,7 +76,7 @@ class EdgeEnd:
     chunk_id: int
     samples: FrameSamples
     dynamic: Collection[int] = ()
-    """Local ids of instances that are known to move (`motion.flag_moving`), which are left out."""
+    """Local ids of instances that are known to move (`motion.flag_dynamic`), which are left out."""
 
 
 def measure_edge(

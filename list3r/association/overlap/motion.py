@@ -91,7 +91,7 @@ class _DepthGrid:
     """Distance of neighbouring samples."""
 
 
-def flag_moving(
+def flag_dynamic(
     samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings | None = None
 ) -> LocalLibrary:
     """Return the library with `dynamic` and `motion` set for what moves against the rest of the chunk.

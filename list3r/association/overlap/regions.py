@@ -61,7 +61,7 @@ class EdgeSupportSettings:
     all_pairs_share: float = 0.98
     """The hypothesis of all pairs is taken where its votes reach this share of the best one's."""
     least_deviation: float = 0.001
-    """Disagreement, as a share of the depth, below which chunks are not told to disagree."""
+    """Disagreement, as a share of the depth, below which chunks do not count as disagreeing."""
 
 
 @dataclass(frozen=True)

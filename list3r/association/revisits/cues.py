@@ -45,7 +45,7 @@ class CueSettings:
 
 @dataclass(frozen=True)
 class InstanceSet:
-    """The instances of one chunk that can be told again: what stands still and is no structure, N of them."""
+    """The instances of one chunk that can be recognised: what stands still and is no structure, N of them."""
 
     local_id: Ints
     """Shape (N,)."""

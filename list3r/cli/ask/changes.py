@@ -7,7 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.terminal import note
 
 
 def changes(

@@ -9,8 +9,8 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask.memory import instance_dict
-from list3r.cli.common import note, print_table
-from list3r.cli.terminal import say
+from list3r.cli.common import print_table
+from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from list3r.queries.relations import Relations
     from list3r.queries.views.camera import PosedCamera
 
-Count = Annotated[int, typer.Option("-k", help="Most answers.")]
+Count = Annotated[int, typer.Option("-k", help="Most answers to return.")]
 MinConfidence = Annotated[
     float | None,
     typer.Option(

@@ -20,8 +20,8 @@ from list3r.cli.ask.arguments import (
 from list3r.cli.ask.changes import changes
 from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
 from list3r.cli.catalog.questions import with_catalog
-from list3r.cli.common import JsonOption, MemoryArgument, note, only, open_memory, print_table, spread, with_at
-from list3r.cli.terminal import say
+from list3r.cli.common import JsonOption, MemoryArgument, only, open_memory, print_table, spread, with_at
+from list3r.cli.terminal import note, say
 
 
 def nearest(

@@ -11,8 +11,8 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.common import JsonOption, note, only, print_table, spread
-from list3r.cli.terminal import write
+from list3r.cli.common import JsonOption, only, print_table, spread
+from list3r.cli.terminal import note, write
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:

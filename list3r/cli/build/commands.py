@@ -104,7 +104,7 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the walk, the memory and the exports.")
     ] = Path("list3r-demo"),
-    seed: Annotated[int, typer.Option("--seed", help="Another seed gives other rooms.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the random rooms.")] = 1,
     frames: Annotated[int, typer.Option("--frames", help="Length of the walk, frames.")] = 300,
     workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Worker processes.")] = None,
     json: JsonOption = False,

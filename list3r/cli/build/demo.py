@@ -22,7 +22,9 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     """Make `out/walk`, `out/rooms.l3r` and the exports beside it; what was found, for JSON."""
     from list3r.pipeline.target import make_folder
 
-    _check_numbers(seed=seed, frames=frames, workers=workers)
+    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("workers", workers, 1)):
+        if value is not None and value < least:
+            raise OptionError(f"--{name} {value}: at least {least} is needed")
     make_folder(out)
     walk, memory = out / "walk", out / "rooms.l3r"
     _print(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
@@ -121,12 +123,6 @@ def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
         say(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
         print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
     return {"trajectory": errors.as_dict(), "scene": scene}
-
-
-def _check_numbers(*, seed: int, frames: int | None, workers: int | None) -> None:
-    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("workers", workers, 1)):
-        if value is not None and value < least:
-            raise OptionError(f"--{name} {value}: at least {least} is needed")
 
 
 def _print(quiet: bool, text: str) -> None:

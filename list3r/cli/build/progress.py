@@ -11,8 +11,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import ProgressBar, progress_bar
-from list3r.cli.common import note
-from list3r.cli.terminal import say
+from list3r.cli.terminal import note, say
 from list3r.pipeline.request import Watch
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ def watching(
 ) -> Iterator[Watch]:
     """Show progress in a bar, and notes above it unless they are not wanted.
 
-    Ctrl-C ends the command with what `interrupted` says, which is told whether a chunk was finished.
+    Ctrl-C ends the command with what `interrupted` says, which hears whether a chunk was finished.
     """
     begun = False
     try:

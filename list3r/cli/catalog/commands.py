@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, note, print_table
-from list3r.cli.terminal import say
+from list3r.cli.common import JsonOption, print_table
+from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
     from list3r.catalog import Catalog

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import asked_at, note, parse_point, print_table
+from list3r.cli.common import asked_at, parse_point, print_table
+from list3r.cli.terminal import note
 
 if TYPE_CHECKING:
     from list3r.catalog import Catalog

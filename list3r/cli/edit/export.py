@@ -15,8 +15,8 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, note, open_memory, spread
-from list3r.cli.terminal import say
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, spread
+from list3r.cli.terminal import note, say
 from list3r.exporters.registry import FORMATS, find_format
 from list3r.pipeline.request import option
 
@@ -83,8 +83,8 @@ def export(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, a page to
-    read, or a folder: models of COLMAP and nerfstudio, a pack for a language model.
+    """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, an HTML
+    report, or a folder: models of COLMAP and nerfstudio, a pack for a language model.
 
     Example: list3r export house.l3r --to usd --out house.usdc
     """

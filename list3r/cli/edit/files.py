@@ -52,11 +52,11 @@ def _is_broken(memory: Path, error: Exception) -> bool:
     """Whether a file that cannot be opened is an SQLite file with broken pages, and not some other file."""
     import sqlite3
 
+    from list3r.exporters.output import is_database
+
     cause = error.__cause__
-    if not isinstance(cause, sqlite3.DatabaseError) or isinstance(cause, sqlite3.OperationalError):
-        return False
-    with memory.open("rb") as file:
-        return file.read(16) == b"SQLite format 3\x00"
+    broken = isinstance(cause, sqlite3.DatabaseError) and not isinstance(cause, sqlite3.OperationalError)
+    return broken and is_database(memory)
 
 
 def repair(

@@ -10,7 +10,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, print_table
-from list3r.cli.measure.inputs import is_memory, is_source, read_points, read_trajectory
+from list3r.cli.measure.inputs import is_source, read_points, read_trajectory
 from list3r.cli.measure.options import (
     Estimate,
     EveryOption,
@@ -24,6 +24,7 @@ from list3r.cli.measure.options import (
     save_picture,
 )
 from list3r.cli.terminal import say
+from list3r.exporters.output import is_database
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -154,7 +155,7 @@ def _cloud_alignment(
             S = register(true.points, _normals(true), near, with_scale=free, settings=IcpSettings()) @ S
             steps.append(f"{kind} by point-to-plane ICP")
             continue
-        if not is_memory(estimate_path) and not estimate_path.suffix.lower() == ".txt":
+        if not is_database(estimate_path) and not estimate_path.suffix.lower() == ".txt":
             raise OptionError(f"--align {word}: {estimate_path} has no camera path; give one with --path")
         goal = true_path if by_source and true_path is not None else read_trajectory(Path(word))
         S = alignment_of(goal, read_trajectory(estimate_path), with_scale=free)

@@ -11,7 +11,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, open_memory, print_table, spread
 from list3r.cli.measure.cloud import cloud
-from list3r.cli.measure.inputs import align_by_path, is_memory, mask_frames, read_scene_of, read_trajectory
+from list3r.cli.measure.inputs import align_by_path, mask_frames, read_scene_of, read_trajectory
 from list3r.cli.measure.options import (
     Estimate,
     PlotOption,
@@ -26,6 +26,7 @@ from list3r.cli.measure.options import (
 )
 from list3r.cli.measure.revisits import revisits
 from list3r.cli.terminal import say
+from list3r.exporters.output import is_database
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,16 +146,17 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: 
     from list3r.memory.errors import OptionError
 
     align = asked.align
-    if align not in (None, "none") and estimate.is_file() and not is_memory(estimate):
+    if align not in (None, "none") and estimate.is_file() and not is_database(estimate):
         raise OptionError(f"--align {align} aligns a memory; {estimate} is not one and has no camera path")
     check_scale(asked.scale)
     check_plot(asked.plot)
     check_every(asked.every)
     true, found = read_scene(truth), read_scene_of(estimate)
     beside = truth.parent / "groundtruth.txt"
-    if align is None and is_memory(estimate) and beside.is_file():
+    if align is None and is_database(estimate) and beside.is_file():
         align = str(beside)
-    S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, asked.scale)
+    free = free_scale(asked.scale, estimate)
+    S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, free=free)
     scores = evaluate_scene(found, true, S_truth_scene)
     scores["identities"] = _identities(true, truth, estimate, asked.ids, asked.every)
     if asked.plot is not None:
@@ -187,7 +189,7 @@ def _identities(
     folder = ids or truth.parent / "ids"
     if ids is not None and not ids.is_dir():
         raise OptionError(f"--ids {ids} is not a folder; give the folder with one picture of true ids per frame")
-    if not is_memory(estimate):
+    if not is_database(estimate):
         if ids is not None:
             raise OptionError(f"--ids: {estimate} has no masks; id switches are measured on a memory")
         return None

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.cli.common import note, open_memory
+from list3r.cli.common import open_memory
+from list3r.cli.terminal import note
+from list3r.exporters.output import is_database
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,14 +25,6 @@ if TYPE_CHECKING:
 _SOURCES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".r3d", ".sens", ".bag", ".mcap", ".db3", ".vrs")
 
 
-def is_memory(path: Path) -> bool:
-    """Whether a file is a database, and so a memory if anything here."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(16) == b"SQLite format 3\x00"
-
-
 def is_source(path: Path) -> bool:
     """Whether a path is read as frames."""
     return path.is_dir() or path.suffix.lower() in _SOURCES
@@ -38,7 +32,7 @@ def is_source(path: Path) -> bool:
 
 def scale_of(path: Path) -> str:
     """metric, anchored or relative for a memory; metric for anything else."""
-    if not is_memory(path):
+    if not is_database(path):
         return "metric"
     with open_memory(path) as scene:
         return str(scene.store.facts.scale_kind or "relative")
@@ -53,7 +47,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
     if is_source(path):
         return _given(path)
-    return _stored(path) if is_memory(path) else read_tum(path)
+    return _stored(path) if is_database(path) else read_tum(path)
 
 
 def _stored(path: Path) -> Trajectory:
@@ -145,15 +139,8 @@ def read_depth_frames(path: Path, every: int | None, width: int) -> DepthFrames:
     if len(frames) < 2:
         raise OptionError(f"{path}: {len(frames)} frames with depth and a pose; at least 2 are needed")
     depth = np.stack([f[2] for f in frames])
-    thinned = replace(
-        camera.pinhole(),
-        width=depth.shape[2],
-        height=depth.shape[1],
-        fx=camera.fx / stride,
-        fy=camera.fy / stride,
-        cx=(camera.cx - first) / stride,
-        cy=(camera.cy - first) / stride,
-    )
+    moved = replace(camera, width=camera.width - first, height=camera.height - first)
+    thinned = replace(moved, cx=camera.cx - first, cy=camera.cy - first).every(stride)
     index, time_s = (np.array([f[k] for f in frames]) for k in (0, 1))
     return DepthFrames(index.astype(np.int64), time_s, depth, np.stack([f[3] for f in frames]), thinned)
 
@@ -178,7 +165,7 @@ def read_points(path: Path, every: int | None = None) -> tuple[PointCloud, Traje
 
     if is_source(path):
         return _fused(path, every)
-    if is_memory(path):
+    if is_database(path):
         return _remembered(path)
     return read_cloud(path), None
 
@@ -231,17 +218,16 @@ def read_scene_of(path: Path) -> dict[str, Any]:
     from list3r.evaluation.scene import read_scene
     from list3r.exporters.scene_json import scene_dict
 
-    if not is_memory(path):
+    if not is_database(path):
         return read_scene(path)
     with open_memory(path) as scene:
         return scene_dict(scene.store)
 
 
-def align_by_path(truth: Path, estimate: Path, scale: str) -> Sim3:
-    """S_truth_estimate from the camera's path in both; `scale` is free, fixed, or auto (free for relative memories)."""
+def align_by_path(truth: Path, estimate: Path, *, free: bool) -> Sim3:
+    """S_truth_estimate from the camera's path in both."""
     from list3r.evaluation.scene import alignment_of
 
-    free = scale == "free" or (scale == "auto" and scale_of(estimate) == "relative")
     return alignment_of(read_trajectory(truth), read_trajectory(estimate), with_scale=free)
 
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from list3r.cli.common import note
 from list3r.cli.measure.inputs import scale_of
+from list3r.cli.terminal import note
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,5 +74,5 @@ def save_picture(figure: Figure, path: Path) -> None:
 
 
 def free_scale(scale: str, estimate: Path) -> bool:
-    """Whether the scale of an alignment is free: as told, or by `auto` for a memory of relative scale."""
+    """Whether the scale of an alignment is free: as asked, or by `auto` for a memory of relative scale."""
     return scale == "free" or (scale == "auto" and scale_of(estimate) == "relative")

@@ -97,7 +97,7 @@ def precompute(
     request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
     given: src.SourceArguments,
     run: Annotated[RunOptions, only("licence")],
-    force: Annotated[bool, typer.Option("--force", help="Write chunks again that are there already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write finished chunks again.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Reconstruct a video into .npz files, for `build --reconstruction precomputed --weights DIR` on another machine.

@@ -38,7 +38,7 @@ def detect(
     given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
-    """Name the things of a memory by a box detector, whose boxes vote over many frames. Names by an operator stay.
+    """Name the things of a memory with a box detector, whose boxes vote over many frames. Names by an operator stay.
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """

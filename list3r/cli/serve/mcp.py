@@ -10,7 +10,8 @@ import typer
 
 from list3r.cli import terminal
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, note
+from list3r.cli.common import JsonOption, MemoryArgument
+from list3r.cli.terminal import note
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory

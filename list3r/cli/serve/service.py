@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from list3r.cli.catalog.commands import CatalogOption
-from list3r.cli.common import note
-from list3r.cli.terminal import say
+from list3r.cli.terminal import note, say
 
 SECRET_VARIABLE = "LIST3R_SERVE_SECRET"
 _FIRST_TOKEN_HOURS = 24.0

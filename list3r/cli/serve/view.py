@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from list3r.cli.common import note
+from list3r.cli.terminal import note
 
 
 def view(

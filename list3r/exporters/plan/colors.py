@@ -1,4 +1,4 @@
-"""Colours of a plan: few, told apart by people who see colours otherwise, and different between neighbours."""
+"""Colours of a plan: few, distinct for colour-blind people, and different between neighbours."""
 
 from __future__ import annotations
 

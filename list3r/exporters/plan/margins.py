@@ -95,7 +95,7 @@ def draw_legend(sheet: Sheet, things: list[Instance], unit: str) -> None:
 def _legend_column(sheet: Sheet, rows: list[Instance], unit: str, x: float, y: float) -> None:
     k = OVERSAMPLING
     right = x + sheet.layout.column_px * k
-    sizes = [_size_text(i) for i in rows]
+    sizes = [" x ".join(f"{v:.2f}" if v < 10 else f"{v:.1f}" for v in i.box.size) for i in rows]
     reserved = max(sheet.draw.textlength(s, font=sheet.text_font) for s in sizes) + 12 * k
     sheet.text((x + 46 * k, y + 4 * k), "name or description", sheet.text_font, GREY)
     sheet.text((right, y + 4 * k), f"size, {unit}", sheet.text_font, GREY, anchor="ra")
@@ -121,10 +121,6 @@ def _shorten(sheet: Sheet, text: str, width: float) -> str:
     while text and sheet.draw.textlength(text + "…", font=sheet.text_font) > width:
         text = text[:-1]
     return text.rstrip() + "…"
-
-
-def _size_text(instance: Instance) -> str:
-    return " x ".join(f"{v:.2f}" if v < 10 else f"{v:.1f}" for v in instance.box.size)
 
 
 def round_length(limit: float) -> float:

@@ -35,7 +35,7 @@ class SimreadySettings:
     workers: int | None = None
     """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
     progress: Callable[[int, int], None] | None = None
-    """Is told how many of the things are done, and how many there are."""
+    """Called with how many of the things are done, and how many there are."""
     one_folder: int = 1000
     """Of more props than this a thousand ids share a folder, `from_12000`."""
 

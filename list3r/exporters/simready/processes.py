@@ -26,7 +26,7 @@ class Making:
     workers: int | None
     """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
     progress: Callable[[int, int], None] | None
-    """Is told how many of the things are done, and how many there are."""
+    """Called with how many of the things are done, and how many there are."""
 
 
 def write_props(store: Store, things: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:

@@ -189,7 +189,8 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> VideoTimest
         if np.any(shown == _NONE):
             continue
         # AVI has no time of showing: FFmpeg makes it up from the place in the file where the codec reorders pictures.
-        counted = joined or (reorders and (decoding or (container.format.name == "avi" and _ascend(shown))))
+        made_up = container.format.name == "avi" and bool(np.all(np.diff(shown) > 0))
+        counted = joined or (reorders and (decoding or made_up))
         known, keys = np.sort(shown), np.sort(shown[rows[:, 2] > 0])
         once = np.searchsorted(known, keys, side="right") - np.searchsorted(known, keys, side="left") == 1
         if joined:
@@ -201,10 +202,6 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> VideoTimest
         return VideoTimestamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)
     none = np.zeros(0, np.int64)
     return VideoTimestamps(np.zeros(len(rows), np.int64), none, unit, rate, False, False, True, aspect, focal, notes)
-
-
-def _ascend(stamps: NDArray[np.int64]) -> bool:
-    return bool(np.all(np.diff(stamps) > 0))
 
 
 def _joined(rows: _Rows) -> tuple[_Rows, bool]:

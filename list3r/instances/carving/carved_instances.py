@@ -24,9 +24,9 @@ from list3r.instances.carving.carved_surfaces import (
     ChangedPlaceSettings,
     Ints,
     ask,
+    compared,
     gone,
     lift,
-    told,
 )
 from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.support import thin
@@ -68,7 +68,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         here = [c for c, *_ in asked if c.component == chunk.component]
         came = [left[c.chunk_id] for c in here if _is(c, session_id) != _is(chunk, session_id)]
         nodes = store.local_instances.nodes([chunk.chunk_id])
-        place = _Change(left[chunk.chunk_id], came, told(seen, s), unit, s)
+        place = _Change(left[chunk.chunk_id], came, compared(seen, s), unit, s)
         standing = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
         clusters = _unexplained(place, nodes, standing, chunk)
         if not clusters:
@@ -116,15 +116,15 @@ def _is_thing(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
 class _Change:
     """What one chunk shows to have changed, world coordinates.
 
-    `gone` are its surfaces that the other sessions see through, `came` theirs that it sees through, `told` its surfaces
-    of which the others tell anything. Shapes (N, 3).
+    `gone` are its surfaces that the other sessions see through, `came` theirs that it sees through, `compared` its
+    surfaces that the others see or see through. Shapes (N, 3).
     """
 
     def __init__(
-        self, gone: Array, came: Sequence[Array], told: Array, unit: float, settings: ChangedPlaceSettings
+        self, gone: Array, came: Sequence[Array], compared: Array, unit: float, settings: ChangedPlaceSettings
     ) -> None:
         self.gone, self.unit, self.settings = gone, unit, settings
-        self._told = cKDTree(told)
+        self._compared = cKDTree(compared)
         self._either = cKDTree(np.concatenate([gone, *came]))
 
     def explains(self, support: Array) -> bool:
@@ -139,7 +139,7 @@ class _Change:
         near = np.asarray(self._either.query(support, distance_upper_bound=link)[0] < np.inf)
         if float(np.mean(near)) >= self.settings.explained or not near.any():
             return bool(near.any())
-        known = np.asarray(self._told.query(support, distance_upper_bound=reach)[0] < np.inf)
+        known = np.asarray(self._compared.query(support, distance_upper_bound=reach)[0] < np.inf)
         return bool(known.any() and float(np.mean(near[known])) >= self.settings.explained)
 
 

@@ -60,7 +60,7 @@ class ChangedPlaceSettings:
 
 @dataclass(frozen=True)
 class CarvedSurfaces:
-    """The surfaces of one chunk, one point for each occupied cell, world coordinates, with what frames tell of them."""
+    """The surfaces of one chunk, one point for each occupied cell, world coordinates, with how frames see them."""
 
     points: Array
     """Shape (N, 3)."""
@@ -82,7 +82,7 @@ def lift(view: DepthView) -> tuple[Array, Ints, Ints]:
 
 
 def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: ChangedPlaceSettings) -> CarvedSurfaces:
-    """Return the surfaces that a chunk's keyframes see, and what the frames of the other sessions tell of them."""
+    """Return the surfaces that a chunk's keyframes see, and how the frames of the other sessions see them."""
     points = _cells([lift(v) for v in own], own, unit, s)
     blocks = _SurfaceBlocks(points, s.block_m * unit)
     counts = {}
@@ -90,9 +90,9 @@ def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: C
         met, free = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
         for view in views:
             rows = blocks.seen_by(view, s.visibility.most_depth_m)
-            told = point_visibility(points[rows], view, s.visibility)
-            met[rows[told == MET]] += 1
-            free[rows[told == FREE]] += 1
+            seen = point_visibility(points[rows], view, s.visibility)
+            met[rows[seen == MET]] += 1
+            free[rows[seen == FREE]] += 1
         counts[name] = met, free
     met, free = counts["own"]
     sure = (met >= s.least_told) & (free <= s.own_free * met)
@@ -146,6 +146,6 @@ def gone(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     return np.asarray(seen.points[seen.own & through])
 
 
-def told(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
-    """Return the surfaces that the other sessions tell of, one way or the other. Shape (K, 3)."""
+def compared(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
+    """Return the surfaces that the other sessions see or see through. Shape (K, 3)."""
     return np.asarray(seen.points[seen.free + seen.met >= s.least_told])

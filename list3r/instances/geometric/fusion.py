@@ -41,12 +41,6 @@ class View:
     """Shape (h, w, 3)."""
 
 
-def working_camera(camera: Camera, stride: int) -> Camera:
-    """The camera of an image of which every `stride`-th pixel is kept."""
-    height, width = -(-camera.height // stride), -(-camera.width // stride)
-    return Camera(width, height, camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
-
-
 def small_color(color: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
     """Colour at working size, smoothed before every `stride`-th pixel is kept."""
     blurred = cv2.blur(color, (2 * stride - 1, 2 * stride - 1)) if stride > 1 else color

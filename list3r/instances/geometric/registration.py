@@ -32,7 +32,7 @@ def align_views(views: Sequence[View], unit: float) -> list[View]:
     placed: list[View] = []
     for number, view in enumerate(views):
         start = corrections[-1] if corrections else np.eye(4)
-        references = [placed[k] for k in _references(number)]
+        references = [placed[number - step] for step in (4, 2, 1) if step <= number]
         correction = _align(view, references, start, unit) if references else start
         corrections.append(correction)
         placed.append(moved_view(view, correction))
@@ -46,10 +46,6 @@ def moved_view(view: View, correction: Pose) -> View:
     return replace(
         view, T_chunk_cam=correction @ view.T_chunk_cam, points=view.points @ R.T + t, normals=view.normals @ R.T
     )
-
-
-def _references(number: int) -> list[int]:
-    return sorted({number - step for step in (1, 2, 4) if number - step >= 0})
 
 
 def _align(view: View, references: Sequence[View], start: Pose, unit: float) -> Pose:

@@ -18,7 +18,6 @@ from list3r.instances.geometric.fusion import (
     normals_of,
     single_sigma,
     small_color,
-    working_camera,
 )
 from list3r.instances.geometric.kernels import read_across
 from list3r.instances.geometric.registration import align_views, moved_view
@@ -32,7 +31,7 @@ class ChunkViews:
     def __init__(self, frames: Sequence[Frame], reconstruction: Reconstruction, settings: InstanceSettings) -> None:
         self.frames, self.reconstruction, self.settings = frames, reconstruction, settings
         self.stride = max(1, round(reconstruction.camera.width / settings.view.width_px))
-        self.camera = working_camera(reconstruction.camera, self.stride)
+        self.camera = reconstruction.camera.every(self.stride)
         self.unit = working_unit(reconstruction)
         self.anchors = pick_anchors(frames, reconstruction, settings.anchor_step)
         self.noise_scale = 1.0

@@ -16,8 +16,8 @@ from list3r.instances.settings import FEATURE_SPACE, MoverInstanceSettings
 from list3r.instances.tracking.reprojection import encode_labels
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, MotionTrack, Support
 from list3r.reconstruction.base import Reconstruction, backproject
-from list3r.reconstruction.motion.moving import SmallFrames
-from list3r.reconstruction.motion.moving_tracks import Blob, measure_blob, middles
+from list3r.reconstruction.motion.free_space import SmallFrames
+from list3r.reconstruction.motion.tracks import Blob, measure_blob, middles
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 
@@ -35,13 +35,13 @@ def with_movers(
     Their points come from the frames' own depth, for the reconstruction holds what stays alone.
     """
     s = settings or MoverInstanceSettings()
-    if reconstruction.moving is None:
+    if reconstruction.movers is None:
         return library
-    camera, width = reconstruction.camera, reconstruction.moving.shape[2]
+    camera, width = reconstruction.camera, reconstruction.movers.shape[2]
     small = SmallFrames.of([f.depth for f in frames], reconstruction.T_chunk_cam, reconstruction.posed, camera, width)
     first = len(library.instances)
     found: list[LocalInstance] = []
-    for number in range(1, int(reconstruction.moving.max()) + 1):
+    for number in range(1, int(reconstruction.movers.max()) + 1):
         instance = _instance(first + len(found), number, frames, reconstruction, small, s)
         if instance is not None:
             found.append(instance)
@@ -61,8 +61,8 @@ def _instance(
     small: SmallFrames,
     s: MoverInstanceSettings,
 ) -> LocalInstance | None:
-    assert reconstruction.moving is not None
-    masks = reconstruction.moving == number
+    assert reconstruction.movers is not None
+    masks = reconstruction.movers == number
     positions = np.flatnonzero(masks.any(axis=(1, 2))).tolist()
     blobs = [b for b in (measure_blob(masks[p], frames[p].color, small, p) for p in positions) if b is not None]
     if not blobs:

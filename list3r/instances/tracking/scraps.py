@@ -22,18 +22,18 @@ def scrap_instances(
 
     They are seen on anchors alone: what is not listed is not worth following from frame to frame.
     """
-    told = [(p, identity_of(p)) for p in proposals if len(p.score)]
-    if not told:
+    numbered = [(p, identity_of(p)) for p in proposals if len(p.score)]
+    if not numbered:
         return ()
-    kept, numbers, s = [p for p, _ in told], [n for _, n in told], settings.scraps
+    kept, numbers, s = [p for p, _ in numbered], [n for _, n in numbered], settings.scraps
     count = 1 + max(int(n.max()) for n in numbers)
     stride, images = views.stride, dict[int, NDArray[np.int32]]()
-    for p, n in told:
+    for p, n in numbered:
         images[p.position] = np.append(0, n + 1).astype(np.int32)[p.labels[::stride, ::stride]]
     supports = collect_supports(views, kept, list(images.values()), count, s.support_points)
     tracks = LabelledChunk(views, kept, numbers, supports, settings).follow(images.__getitem__, sorted(images))
-    whole = {k: float(v) for p, n in told for k, v in zip(n.tolist(), p.score, strict=True)}
-    feature = {k: v for p, n in told for k, v in zip(n.tolist(), p.features, strict=True)}
+    whole = {k: float(v) for p, n in numbered for k, v in zip(n.tolist(), p.score, strict=True)}
+    feature = {k: v for p, n in numbered for k, v in zip(n.tolist(), p.features, strict=True)}
     camera, least = views.reconstruction.camera, min(s.least_anchors, len(views.anchors))
     out: list[LocalInstance] = []
     for number, (track, support) in enumerate(zip(tracks, supports, strict=True)):

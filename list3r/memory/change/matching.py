@@ -1,4 +1,4 @@
-"""The sessions told one after another: who was seen again, who moved, who went, who came."""
+"""Match the instances of one session after another: seen again, moved, removed, added."""
 
 from __future__ import annotations
 

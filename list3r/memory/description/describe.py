@@ -7,7 +7,7 @@ import numpy as np
 from list3r.memory.geometry import Array
 
 _SMALL_M = 0.6
-"""Longest edge of what can be told to be round: of larger instances too little is seen."""
+"""Longest edge of what can be called round: of larger instances too little is seen."""
 _SURFACE_M = 0.008
 """Deviation of support points from the surface that they lie on."""
 

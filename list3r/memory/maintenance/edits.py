@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import getpass
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from list3r.memory.constraints import Edit, Key, key_name, standing
@@ -18,7 +18,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
 from list3r.memory.maintenance.split_proposal import propose_split
-from list3r.memory.records import MergeDecision, Observation
+from list3r.memory.records import JsonFields, MergeDecision, Observation
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.edits import LogEntry
 from list3r.memory.world.scale import measure, parse_anchor, rescale
@@ -28,7 +28,7 @@ _LONGEST = 200
 
 
 @dataclass(frozen=True)
-class EditReport:
+class EditReport(JsonFields):
     """What an edit did."""
 
     entry: int
@@ -45,10 +45,6 @@ class EditReport:
     """Ids that had retired and name an instance again."""
     text: str
     """One sentence."""
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def merge(store: Store, a: int, b: int, author: str | None = None) -> EditReport:

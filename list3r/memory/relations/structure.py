@@ -70,7 +70,7 @@ def classify_structure(
 
     `floor_height` is the z of the floor at that place, None where it was not seen; `eye_level` gives the height of the
     cameras that saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level,
-    lies at the floor, and is no rug, which chunks told from a floor that is seen beside it; a ceiling is level, above
+    lies at the floor, and is no rug, which chunks distinguish from the floor beside it; a ceiling is level, above
     the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. What the chunks
     flagged in the main and is none of these is `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet
     front stands in the room and is no structure. What lies near an instance decides, so `around` may be all instances
@@ -110,7 +110,7 @@ def _bordered(sheet: Array, floor: Array, unit: float, s: StructureSettings) -> 
 
 
 def flagged_only(instances: Sequence[InstanceGeometry]) -> list[str | None]:
-    """`plane` for what the chunks took for structure in the main, else None: all that can be told without gravity."""
+    """`plane` for what the chunks took for structure in the main, else None: no more is known without gravity."""
     return ["plane" if b.flagged > 0.5 else None for b in instances]
 
 

@@ -53,8 +53,8 @@ def estimated_camera(
     is mapped, that map tells the rest.
     """
     name, info = entry(settings.reconstruction).calibration, source.info
-    told = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
-    if not name or (info.camera is not None and told):
+    distortion_known = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
+    if not name or (info.camera is not None and distortion_known):
         return None
     with threadpool_limits(1):
         progress = None if look is None else (lambda done, total: look("camera", done, total))

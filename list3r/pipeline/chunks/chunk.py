@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.overlap.motion import flag_moving
+from list3r.association.overlap.motion import flag_dynamic
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunking.borrowing import Borrowed, Repeat, borrow, frames_around
 from list3r.frames.chunking.chunks import ChunkSpan
@@ -239,7 +239,7 @@ def _described(
     keyframes = make_keyframes(frames, reconstruction, s.keep_pictures, s.models.keyframes, by, library)
     samples = frame_samples(reconstruction, library, s.models.samples)
     if reconstruction.depth_noise is None:  # stereo has no depth where things move; what it sees through is error
-        library = flag_moving(samples, library, reconstruction.camera, s.motion)
+        library = flag_dynamic(samples, library, reconstruction.camera, s.motion)
     clock.mark("keyframes")
     if task.debug_dir is not None:
         draw_debug(frames, reconstruction, library, Path(task.debug_dir) / f"chunk-{task.span.index:04d}")

@@ -86,7 +86,7 @@ class OrderedPool(Generic[Task, Result]):
     def start(self, work: Callable[[Question], object], question: Question) -> None:
         """Start all processes now and let each call a function first, such as one that imports what tasks will need.
 
-        Nothing waits for it, and what it raises is not told.
+        Nothing waits for it, and what it raises is dropped.
         """
         for _ in range(self._workers):
             self._submit(work, question)

@@ -106,7 +106,7 @@ class Clause:
 
 def parse(text: str) -> Phrase:
     """Parse a question. Raises `OptionError` for one that is empty, too long, or ends in a relation."""
-    tokens = _tokens(text)
+    tokens = re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text.lower())  # names of predicates (next_to) come apart
     if not tokens:
         raise OptionError(f"{text!r} has no word to look for; ask for example for: white mug on table")
     if len(tokens) > _MOST_WORDS:
@@ -114,14 +114,9 @@ def parse(text: str) -> Phrase:
     return _sentence(tokens, text)
 
 
-def _tokens(text: str) -> list[str]:
-    """Return words in lower case and numbers; the names of predicates (next_to) come apart into what people say."""
-    return re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text.lower())
-
-
 def _sentence(tokens: list[str], text: str) -> Phrase:
     """Return the first phrase with its clauses; "and" before a relation comes back to it."""
-    start = _next_relation(tokens, 0)
+    start = next((n for n in range(len(tokens)) if _relation_at(tokens, n)[0]), None)
     head = _phrase(tokens[: start if start is not None else len(tokens)])
     clauses: list[Clause] = []
     while start is not None:
@@ -176,10 +171,6 @@ def _relation_at(tokens: list[str], k: int) -> tuple[int, tuple[str, ...]]:
         if length > 1 and without != words and without in _PHRASES and words[0] != "the" and words[-1] != "the":
             return length, _PHRASES[without]
     return 0, ()
-
-
-def _next_relation(tokens: list[str], k: int) -> int | None:
-    return next((n for n in range(k, len(tokens)) if _relation_at(tokens, n)[0]), None)
 
 
 def _next_and(tokens: list[str], start: int) -> int:

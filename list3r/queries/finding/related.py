@@ -162,7 +162,7 @@ def _near_structure(search: PhraseSearch, subjects: dict[int, PhraseMatch], o: I
 
 
 def _viewpoint(search: PhraseSearch, o: Instance) -> Place | None:
-    """Return from where left and right are told: as asked, else the picture in which the other thing is seen best."""
+    """Return the viewpoint of left and right: as asked, else the picture in which the other thing is seen best."""
     if search.viewpoint is not None:
         return search.viewpoint
     if o.best_view is None:

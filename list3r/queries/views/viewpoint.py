@@ -48,7 +48,7 @@ class BetweenRelation(Relation):
 
 
 def viewed(viewer: Viewpoint, subject: Instance, object: Instance, noise: float) -> list[Relation] | None:
-    """Return the viewpoint relations of two things; None where they cannot be told: the viewer stands above, below or
+    """Return the viewpoint relations of two things; None where they are undefined: the viewer stands above, below or
     amidst them, or they are in different connected components.
 
     `noise` is the standard deviation of a position, world units.

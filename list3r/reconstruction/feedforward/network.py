@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Answer = Callable[[Any, "torch.Tensor", "torch.Tensor | None"], WindowOutput]
 """Poses, depth, confidence and focal lengths that a model tells of pictures (n, 3, h, w) in [0, 1]. The last argument
-are known intrinsics of the pictures, px, (n, 3, 3), pixel centres at whole numbers, for models that can be told."""
+are known intrinsics of the pictures, px, (n, 3, 3), pixel centres at whole numbers, for models that take them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Settings of what finds and follows surfaces that move."""
+"""Settings of the two ways to find movers (what moves while it is filmed), and of their tracks."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from list3r.reconstruction.base import SensorNoise
 
 
 @dataclass(frozen=True)
-class MoverSettings:
-    """When a surface counts as moving of its own."""
+class ResidualMoverSettings:
+    """When a surface counts as a mover because it disagrees with the motion of the camera."""
 
     least_share: float = 0.02
     """Smallest surface that is looked at, share of the picture."""
@@ -42,8 +42,8 @@ class MoverSettings:
 
 
 @dataclass(frozen=True)
-class MovingSurfaceSettings:
-    """When a surface counts as seen through."""
+class FreeSpaceMoverSettings:
+    """When a surface counts as a mover because other frames see through its place."""
 
     width: int = 160
     """Width of the small images, px: every n-th pixel of the frame."""
@@ -88,8 +88,8 @@ class MovingSurfaceSettings:
 
 
 @dataclass(frozen=True)
-class FollowSettings:
-    """What belongs together over time."""
+class MoverTrackSettings:
+    """Which movers of several frames are one thing."""
 
     least_share: float = 0.0015
     """Smallest blob, share of the picture."""

@@ -63,10 +63,10 @@ PUBLISHED: dict[str, Any] = {
 def load(cls: Any, path: Path, device: torch.device) -> Any:
     """Return the network. Raises `OptionError` in one line."""
     beside = path / "config.json"
-    told = PUBLISHED | (json.loads(beside.read_text(encoding="utf-8")) if beside.is_file() else {})
+    config = PUBLISHED | (json.loads(beside.read_text(encoding="utf-8")) if beside.is_file() else {})
 
     def make_network() -> Any:
-        return cls(cls.config_class(**told))
+        return cls(cls.config_class(**config))
 
     make_network.__name__ = cls.__name__
     file = path / "model.safetensors"
@@ -78,10 +78,10 @@ def load(cls: Any, path: Path, device: torch.device) -> Any:
 
 
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-    """See `feedforward.Answer`; the network cannot be told the intrinsics, though it could be told rays."""
+    """See `feedforward.Answer`; the network takes no intrinsics (it could take rays)."""
     import torch
 
-    yes, no = (pictures.new_full((1,), told).bool() for told in (1, 0))
+    yes, no = (pictures.new_full((1,), value).bool() for value in (1, 0))
     asked = views(pictures)
     for view in asked:
         no_rays = pictures.new_full((1, *pictures.shape[-2:], 6), torch.nan)

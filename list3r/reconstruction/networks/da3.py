@@ -36,7 +36,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-    """See `feedforward.Answer`; without poses the network cannot be told the intrinsics."""
+    """See `feedforward.Answer`; without poses the network takes no intrinsics."""
     # The inner network: the outer one chooses half precision by asking CUDA, which a CPU has not got.
     output = model.model(normalised(pictures)[None], export_feat_layers=[])
     if "extrinsics" not in output or "depth_conf" not in output:

@@ -30,7 +30,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-    """See `feedforward.Answer`; the network cannot be told the intrinsics."""
+    """See `feedforward.Answer`; the network takes no intrinsics."""
     plan, found = pair_plan(len(pictures)), []
     for start in range(0, len(plan), AT_ONCE):
         rows = plan[start : start + AT_ONCE]

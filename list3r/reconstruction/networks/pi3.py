@@ -31,7 +31,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-    """See `feedforward.Answer`; the network cannot be told the intrinsics."""
+    """See `feedforward.Answer`; the network takes no intrinsics."""
     return read(model(pictures[None]))
 
 

@@ -1,4 +1,4 @@
-"""Reconstruction `pi3x`, the successor of `pi3`: smoother, and can be told the intrinsics.
+"""Reconstruction `pi3x`, the successor of `pi3`: smoother, and takes known intrinsics.
 
 Told intrinsics count pixels from the picture's corner (the first centre is at a half). `decode` makes a mask over all
 pairs of tokens of all pictures, 9 GB for 100 of them, for poses that nobody gave; so it is not asked to look for poses.
@@ -58,10 +58,10 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
     """See `feedforward.Answer`."""
     if K is None:
         return read(model(imgs=pictures[None], with_prior=False))
-    told = K.clone()
-    told[:, :2, 2] += 0.5
+    shifted = K.clone()
+    shifted[:, :2, 2] += 0.5
     everywhere = pictures.new_ones((1, len(pictures))).bool()
-    return read(model(imgs=pictures[None], intrinsics=told[None], mask_add_ray=everywhere))
+    return read(model(imgs=pictures[None], intrinsics=shifted[None], mask_add_ray=everywhere))
 
 
 NETWORK = Network("pi3x", "pi3.models.pi3x", "Pi3X", PictureSize(max_pixels=PIXEL_LIMIT), answer, load)

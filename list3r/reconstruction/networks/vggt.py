@@ -44,7 +44,7 @@ def load(cls: Any, path: Path, device: torch.device) -> Any:
 
 
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-    """See `feedforward.Answer`; the network cannot be told the intrinsics."""
+    """See `feedforward.Answer`; the network takes no intrinsics."""
     output = model(pictures[None])
     T_cam_world, focal = decode_poses(numpy(output["pose_enc"][0]), *pictures.shape[-2:])
     depth = numpy(output["depth"][0, ..., 0]).astype(np.float32)

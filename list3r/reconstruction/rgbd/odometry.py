@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.frames.deferred import LazyFrame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
-from list3r.reconstruction.motion.movers import Mask, MoverMemory, find_mover, fit, without
+from list3r.reconstruction.motion.residuals import Mask, MoverMemory, fit, mover_in_residuals, without
 from list3r.reconstruction.poses import angle_deg, shows_more
 from list3r.reconstruction.prior import given_step
 from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
@@ -76,9 +76,9 @@ class CameraTracker:
         self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
         self._views: dict[int, WorkingFrame] = {}
-        self._moving: dict[int, Mask] = {}
+        self._mover_masks: dict[int, Mask] = {}
         self._unsure: set[int] = set()
-        self._movers = MoverMemory(settings.movers, settings.noise)
+        self._mover_memory = MoverMemory(settings.movers, settings.noise)
         size = (self.small.width, self.small.height)
         self._known = {
             k: cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
@@ -114,7 +114,7 @@ class CameraTracker:
     def view(self, position: int) -> WorkingFrame:
         """Return the frame at working resolution, without what moves of its own."""
         view = self._whole_view(position)
-        return without(view, self._moving[position]) if position in self._moving else view
+        return without(view, self._mover_masks[position]) if position in self._mover_masks else view
 
     def _whole_view(self, position: int) -> WorkingFrame:
         if position not in self._views:
@@ -127,9 +127,9 @@ class CameraTracker:
         return self._views[position]
 
     @property
-    def moving(self) -> dict[int, Mask]:
+    def mover_masks(self) -> dict[int, Mask]:
         """What was left out of each frame as moving of its own, by position, at working resolution."""
-        return {position: mask for position, mask in sorted(self._moving.items()) if mask.any()}
+        return {position: mask for position, mask in sorted(self._mover_masks.items()) if mask.any()}
 
     def features(self, position: int) -> Features:
         """Return the frame's local features, found once."""
@@ -139,24 +139,19 @@ class CameraTracker:
             self._features[position] = detect(frame.color, frame.depth, self.camera, self.settings.features)
         return self._features[position]
 
-    def _usable(self, position: int) -> bool:
-        return self.frames[position].depth is not None and bool(
-            self.view(position).known_share >= self.settings.least_known
-        )
-
     def _step(self, position: int) -> None:
-        if not self._usable(position):
+        if self.frames[position].depth is None or self.view(position).known_share < self.settings.least_known:
             return
-        moving = self._movers.expect(self._whole_view(position))
+        mask = self._mover_memory.expect(self._whole_view(position))
         if position in self._known:
-            moving = self._known[position] if moving is None else moving | self._known[position]
+            mask = self._known[position] if mask is None else mask | self._known[position]
         for segment in self._open_segments():
-            self._set_moving(position, moving)
+            self._set_mover_mask(position, mask)
             found = self._follow(segment, position)
             if found is not None:
                 self._accept(segment, position, found)
                 return
-        self._set_moving(position, moving)
+        self._set_mover_mask(position, mask)
         self.segments.append(TrackedSegment(SurfelModel(self.settings.fusion, self.settings.noise)))
         self._accept(self.segments[-1], position, np.eye(4))
 
@@ -168,10 +163,10 @@ class CameraTracker:
         return [*last, longest] if short and longest is not None and longest is not last[0] else last
 
     def _accept(self, segment: TrackedSegment, position: int, T_segment_cam: Pose) -> None:
-        if position in self._moving:
+        if position in self._mover_masks:
             self._keep_movers(segment, position, T_segment_cam)
         else:
-            self._movers.mask = None
+            self._mover_memory.mask = None
         segment.T_segment_cam[position] = T_segment_cam
         if position in self._unsure:
             return
@@ -179,20 +174,20 @@ class CameraTracker:
         if not segment.keyframes or self._moved(segment, position):
             segment.keyframes.append(position)
 
-    def _set_moving(self, position: int, moving: Mask | None) -> None:
-        self._moving.pop(position, None)
-        if moving is not None:
-            self._moving[position] = moving
+    def _set_mover_mask(self, position: int, mask: Mask | None) -> None:
+        self._mover_masks.pop(position, None)
+        if mask is not None:
+            self._mover_masks[position] = mask
 
     def _keep_movers(self, segment: TrackedSegment, position: int, T_segment_cam: Pose) -> None:
         """Take what moves out of the model, and carry it on to the next frame until it stands still."""
-        view, mask = self._whole_view(position), self._moving[position]
+        view, mask = self._whole_view(position), self._mover_masks[position]
         samples = segment.model.samples(T_segment_cam, self.small, self.settings.sweep_samples)
         usual = fit(samples, view, mask, T_segment_cam, self.settings.movers, self.settings.noise).outside
-        mask = self._movers.keep(view, mask, T_segment_cam, usual, self.segments.index(segment))
+        mask = self._mover_memory.keep(view, mask, T_segment_cam, usual, self.segments.index(segment))
         if position in self._known:
             mask = mask | self._known[position]
-        self._moving[position] = mask
+        self._mover_masks[position] = mask
         segment.model.forget(view, mask, T_segment_cam)
 
     def _moved(self, segment: TrackedSegment, position: int) -> bool:
@@ -294,9 +289,9 @@ class CameraTracker:
         s, view = self.settings, self.view(position)
         found = register(samples, view, T_guess, s.registration, s.noise, prior)
         if found is not None and not blind:
-            mover = find_mover(samples, view, T_guess, found, s, prior)
+            mover = mover_in_residuals(samples, view, T_guess, found, s, prior)
             if mover is not None and self._trusted(mover[1], samples, position, blind):
-                self._moving[position] = self._moving.get(position, np.zeros_like(mover[0])) | mover[0]
+                self._mover_masks[position] = self._mover_masks.get(position, np.zeros_like(mover[0])) | mover[0]
                 found = mover[1]
         return found if found is not None and self._trusted(found, samples, position, blind) else None
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import PosedOnly, Reconstruction
-from list3r.reconstruction.motion.moving import SmallFrames, find_moving
-from list3r.reconstruction.motion.moving_tracks import follow_movers
+from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
+from list3r.reconstruction.motion.tracks import track_movers
 from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.registry import ModelOptions
@@ -75,23 +75,23 @@ class RgbdReconstructor:
         faced: Mapping[int, Floats] = {}
         if self.poses == "given":
             T, posed = given_poses(frames)
-            moving = self._moving(shown, T[used], posed[used], camera, {})
+            movers = self._find_movers(shown, T[used], posed[used], camera, {})
         else:
             T, posed, keyframes, tracker = self._estimate(frames, camera, used)
-            moving = self._moving(shown, T[used], posed[used], camera, _among(tracker.moving, used))
-            if moving is not None:
-                known = {used[k]: _rim(m > 0) for k, m in enumerate(moving) if m.any()}
+            movers = self._find_movers(shown, T[used], posed[used], camera, _among(tracker.mover_masks, used))
+            if movers is not None:
+                known = {used[k]: _rim(m > 0) for k, m in enumerate(movers) if m.any()}
                 T, posed, keyframes, tracker = self._estimate(frames, camera, used, known)
-                moving = self._moving(shown, T[used], posed[used], camera, _among(tracker.moving, used))
+                movers = self._find_movers(shown, T[used], posed[used], camera, _among(tracker.mover_masks, used))
             faced = _among(tracker.cosines, used)
         if not posed[used].any():
             raise TrackingError(f"the camera is not found in frames {frames[0].index} to {frames[-1].index}")
         if self.poses == "given" or len(used) < len(frames):
             depths = [frame.depth for frame in shown]
             keyframes = select_keyframes(T[used], posed[used], depths, self.settings.odometry.keyframes)
-        if moving is not None:
-            _take_out(depth, moving)
-            faced = {k: cosine for k, cosine in faced.items() if not moving[k].any()}
+        if movers is not None:
+            _take_out(depth, movers)
+            faced = {k: cosine for k, cosine in faced.items() if not movers[k].any()}
         confidence = np.zeros(depth.shape, np.float16)
         for k, image in enumerate(depth):
             confidence[k] = depth_confidence(image, camera, self.settings.confidence, faced.get(k))
@@ -106,11 +106,11 @@ class RgbdReconstructor:
             confidence=confidence,
             scale_kind="metric",
             keyframes=np.array(keyframes, np.int64),
-            moving=moving,
+            movers=movers,
             between=PosedOnly(indices[rest], posed[rest], T[rest]) if len(rest) else None,
         )
 
-    def _moving(
+    def _find_movers(
         self,
         frames: Sequence[Frame],
         T_chunk_cam: NDArray[np.float64],
@@ -118,13 +118,13 @@ class RgbdReconstructor:
         camera: Camera,
         hints: Mapping[int, NDArray[np.bool_]],
     ) -> NDArray[np.uint8] | None:
-        """Number what moves, see `Reconstruction.moving`."""
-        small = SmallFrames.of([f.depth for f in frames], T_chunk_cam, posed, camera, self.settings.moving.width)
-        masks = find_moving(small, hints, self.settings.moving)
+        """Number what moves, see `Reconstruction.movers`."""
+        small = SmallFrames.of([f.depth for f in frames], T_chunk_cam, posed, camera, self.settings.movers.width)
+        masks = movers_in_free_space(small, hints, self.settings.movers)
         if masks is None:
             return None
         times_s = np.array([f.time_s for f in frames])
-        return follow_movers(masks, [f.color for f in frames], times_s, small, self.settings.follow)
+        return track_movers(masks, [f.color for f in frames], times_s, small, self.settings.mover_tracks)
 
     def _estimate(
         self,
@@ -188,10 +188,10 @@ def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
-def _take_out(depth: NDArray[np.float32], moving: NDArray[np.uint8]) -> None:
+def _take_out(depth: NDArray[np.float32], movers: NDArray[np.uint8]) -> None:
     """Make depth (F, H, W) unknown, in place, where something moves: what is left is the scene that stays."""
     height, width = depth.shape[1:]
-    stride = -(-width // moving.shape[2])
-    for position in np.flatnonzero(moving.any(axis=(1, 2))).tolist():
-        full = np.kron(_rim(moving[position] > 0), np.ones((stride, stride), bool))
+    stride = -(-width // movers.shape[2])
+    for position in np.flatnonzero(movers.any(axis=(1, 2))).tolist():
+        full = np.kron(_rim(movers[position] > 0), np.ones((stride, stride), bool))
         depth[position][full[:height, :width]] = 0.0

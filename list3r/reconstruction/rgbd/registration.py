@@ -75,7 +75,7 @@ class KnownFeatures:
         return _normal_equations(slope, error.ravel(), scale)
 
     def information(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
-        """Return what they tell of the pose found. Shape (6, 6)."""
+        """Return their information about the pose found. Shape (6, 6)."""
         return self.normal_equations(T_model_cam, focal_px)[0]
 
 
@@ -143,9 +143,9 @@ def register(
     T_model_cam: NDArray[np.float64],
     settings: RegistrationSettings,
     noise: SensorNoise,
-    told: KnownFeatures | PosePrior | None = None,
+    constraint: KnownFeatures | PosePrior | None = None,
 ) -> FrameRegistration | None:
-    """Refine `T_model_cam` by surfaces, brightness and what else is `told`; None when too few points meet."""
+    """Refine `T_model_cam` by surfaces, brightness and a `constraint`; None when too few points meet."""
     frame = _Frame(view, noise)
     photometric = model.gray is not None and settings.photometric_weight > 0
     T = np.array(T_model_cam, dtype=np.float64)
@@ -159,8 +159,8 @@ def register(
         found = paired, scale
         if len(paired[1]) < settings.least_pairs:
             return None
-        if told is not None:
-            more, slope = told.normal_equations(T, view.camera.fx)
+        if constraint is not None:
+            more, slope = constraint.normal_equations(T, view.camera.fx)
             information += more
             gradient += slope
         damped = information + 1e-9 * np.trace(information) * np.eye(6)
@@ -171,8 +171,8 @@ def register(
     assert found is not None
     pairs = _SurfelPairs.of(model, *found)
     information = _solid_information(pairs, frame, T, settings, photometric)
-    if told is not None:
-        information += told.information(T, view.camera.fx)
+    if constraint is not None:
+        information += constraint.information(T, view.camera.fx)
     return FrameRegistration(
         T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
     )
@@ -264,11 +264,6 @@ def _pair(model: Samples, frame: _Frame, T: NDArray[np.float64], gate_m: float, 
     return _SurfelPairs.of(model, paired, spread(paired[7], 1e-3))
 
 
-def _geometric(pairs: _SurfelPairs, huber: float) -> NormalEquations:
-    """Normal equations of the point-to-plane residuals for a left-hand step (translation, rotation)."""
-    return _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, huber)
-
-
 def _geometric_slope(pairs: _SurfelPairs) -> Floats:
     return plane_slopes(pairs.moved, pairs.normals, pairs.inverse_sigma)
 
@@ -285,7 +280,8 @@ def _solid_information(
     weighted = weight[:, None] * pairs.moved
     first, second = skew(weighted.sum(axis=0).astype(np.float64)), (weighted.T @ pairs.moved).astype(np.float64)
     feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
-    information = _geometric(pairs, settings.huber)[0] - settings.normal_noise**2 * feigned
+    information = _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, settings.huber)[0]
+    information -= settings.normal_noise**2 * feigned
     if photometric:
         information += settings.photometric_weight * _photometric(pairs, frame, T, settings.gradient_noise)[0]
     return information

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from list3r.reconstruction.base import KeyframeSpacing, SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.motion.settings import FollowSettings, MoverSettings, MovingSurfaceSettings
+from list3r.reconstruction.motion.settings import FreeSpaceMoverSettings, MoverTrackSettings, ResidualMoverSettings
 from list3r.reconstruction.prior import PriorSettings
 
 
@@ -115,7 +115,7 @@ class OdometrySettings:
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     fusion: SurfelSettings = field(default_factory=SurfelSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    movers: MoverSettings = field(default_factory=MoverSettings)
+    movers: ResidualMoverSettings = field(default_factory=ResidualMoverSettings)
     prior: PriorSettings = field(default_factory=PriorSettings)
     """Of poses that the source gives as a prior."""
     noise: SensorNoise = field(default_factory=SensorNoise)
@@ -127,7 +127,7 @@ class RgbdSettings:
 
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
-    moving: MovingSurfaceSettings = field(default_factory=MovingSurfaceSettings)
-    follow: FollowSettings = field(default_factory=FollowSettings)
+    movers: FreeSpaceMoverSettings = field(default_factory=FreeSpaceMoverSettings, metadata={"formerly": "moving"})
+    mover_tracks: MoverTrackSettings = field(default_factory=MoverTrackSettings, metadata={"formerly": "follow"})
     most_step: int = 2
     """Largest step between frames of a slow video that get depth, unless another is asked for (decision 0159)."""

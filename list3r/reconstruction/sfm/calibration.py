@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Camera, FrameSource, guessed_camera, index_at
 from list3r.reconstruction.sfm.colmap import pycolmap
 from list3r.reconstruction.sfm.links import keyframe_problem
-from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, Poses, SparseMap, build_maps
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps
 from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, follow_corners
 
@@ -31,8 +31,6 @@ class CameraCalibration:
     """Windows that it stands on; 0 where none could be mapped and the camera is as it was."""
     focal_px: float | None
     """Focal length by the pictures alone, None where they did not tell."""
-    focal_sigma: float | None = None
-    """Standard deviation of its logarithm."""
     notes: tuple[str, ...] = ()
     """What the user should know, one sentence each."""
 
@@ -61,9 +59,9 @@ def calibrate(
     if known:
         return _of_known(windows, (start, free), chosen, stored_px, _parted(found, stored_px, chosen))
     sigma = _focal_sigma(windows, chosen)
-    said = f"the camera was estimated from the pictures: focal length {_told_px(free, sigma, stored_px)}"
+    said = f"the camera was estimated from the pictures: focal length {_px_text(free, sigma, stored_px)}"
     notes = (f"{said}; distortion k1 {k1:.3f}", *_parted(found, stored_px, chosen))
-    return CameraCalibration(_lens(free, k1, chosen), len(windows), free.fx, sigma, notes)
+    return CameraCalibration(_lens(free, k1, chosen), len(windows), free.fx, notes)
 
 
 def calibrate_by_map(
@@ -87,15 +85,15 @@ def _of_known(
     if abs(np.log(free.fx / start.fx)) > settings.doubted_sigmas * sigma:
         said = (
             f"the given focal length {start.fx * stored_px:.0f} px does not fit the pictures, which suggest about "
-            f"{_told_px(free, sigma, stored_px)}; check --intrinsics, or leave it out"
+            f"{_px_text(free, sigma, stored_px)}; check --intrinsics, or leave it out"
         )
-        return CameraCalibration(start, len(windows), free.fx, sigma, (said,))
+        return CameraCalibration(start, len(windows), free.fx, (said,))
     _, k1 = _adjust_together(windows, start, False, settings)
     lens = _lens(start, k1, settings) if _believable(start, k1, settings) else start
-    return CameraCalibration(lens, len(windows), free.fx, sigma, notes)
+    return CameraCalibration(lens, len(windows), free.fx, notes)
 
 
-def _told_px(camera: Camera, sigma: float, stored_px: float) -> str:
+def _px_text(camera: Camera, sigma: float, stored_px: float) -> str:
     return f"{camera.fx * stored_px:.0f} px, give or take {100 * sigma:.0f} %"
 
 
@@ -267,17 +265,13 @@ def _add_window(made: pycolmap.Reconstruction, number: int, problem: MapProblem,
     for key, T in sorted(found.T_map_cam.items()):
         view: KeyframeView = problem.views[key]
         image = pycolmap.Image(f"{base + key}", view.xy.astype(np.float64) + 0.5, 1, base + key)
-        made.add_image_with_trivial_frame(image, _cam_from_map(T))
+        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(T)[:3]))
         for row, track in enumerate(view.ids.tolist()):
             if track in found.points:
                 seen.setdefault(track, []).append((base + key, row))
     for track, rows in sorted(seen.items()):
         if len(rows) >= 2:
             made.add_point3D(found.points[track], pycolmap.Track([pycolmap.TrackElement(*r) for r in rows]))
-
-
-def _cam_from_map(T_map_cam: Poses) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(np.linalg.inv(T_map_cam)[:3])
 
 
 def _lens(camera: Camera, k1: float, settings: CameraCalibrationSettings) -> Camera:

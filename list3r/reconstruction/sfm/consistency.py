@@ -24,17 +24,17 @@ Seen = Mapping[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]]
 def contradicted(
     T_map_cam: Mapping[int, Floats], seen: Seen, camera: Camera, settings: ConsistencySettings | None = None
 ) -> set[int]:
-    """Keyframes of a map that most of their matches with the others do not bear out, the worst first taken out."""
+    """Keyframes of a map that most of their matches with the others contradict, found worst first."""
     s = settings or ConsistencySettings()
     gate = s.most_px * max(camera.width, camera.height) / 640.0
-    told = {
+    agreeing = {
         pair: (len(xy[0]), int((epipolar_errors(*xy, T_map_cam[pair[0]], T_map_cam[pair[1]], camera) < gate).sum()))
         for pair, xy in sorted(seen.items())
         if pair[0] in T_map_cam and pair[1] in T_map_cam
     }
     left, out = set(T_map_cam), set()
     while left:
-        shares = {k: _share(k, left, told) for k in sorted(left)}
+        shares = {k: _share(k, left, agreeing) for k in sorted(left)}
         worst = min(shares, key=lambda k: (shares[k], k))
         if shares[worst] >= s.least_share:
             break
@@ -57,8 +57,8 @@ def epipolar_errors(
     return np.asarray(np.abs((two * in_b).sum(axis=1)) / np.sqrt(np.maximum(size, 1e-12)))
 
 
-def _share(key: int, left: set[int], told: Mapping[tuple[int, int], tuple[int, int]]) -> float:
+def _share(key: int, left: set[int], agreeing: Mapping[tuple[int, int], tuple[int, int]]) -> float:
     """Share of a keyframe's matches with the others that agree; 1 without any."""
-    mine = [n for pair, n in told.items() if key in pair and pair[0] in left and pair[1] in left]
+    mine = [n for pair, n in agreeing.items() if key in pair and pair[0] in left and pair[1] in left]
     count = sum(count for count, _ in mine)
     return sum(agree for _, agree in mine) / count if count else 1.0

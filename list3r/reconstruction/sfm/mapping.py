@@ -101,7 +101,7 @@ def build_maps(
     if cache is None:
         return []
     grown: list[list[SparseMap]] = []
-    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.told])):
+    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
         maps = _grown(cache, problem, camera, free_camera, pair, chosen)
         grown.append(_without_beside(maps, problem))
         if agreed(grown, chosen) or (maps and all(steady(m, chosen.steady) for m in maps)):
@@ -117,7 +117,7 @@ def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[in
     """Pairs of keyframes from which maps are grown besides: those that share most in the second and the last third."""
     own = sorted(problem.views.keys() - problem.beside)
     place = {key: n for n, key in enumerate(own)}
-    least, most = settings.told_steps
+    least, most = settings.given_steps
     out = []
     for third in (1, 2):
         part = own[third * len(own) // 3 : (third + 1) * len(own) // 3]
@@ -135,10 +135,10 @@ def _grown(
     pair: tuple[int, int] | None,
     settings: MappingSettings,
 ) -> list[SparseMap]:
-    """Maps that grow from two keyframes, one from a pair that is told; none of a camera that only turns."""
+    """Maps that grow from two keyframes, one from a given pair; none of a camera that only turns."""
     options = mapper_options(camera, free_camera, settings)
-    told = pair is not None or free_camera == "focal"
-    options.mapper.init_min_tri_angle = settings.told_angle_deg if told else settings.first_angle_deg
+    given = pair is not None or free_camera == "focal"
+    options.mapper.init_min_tri_angle = settings.given_angle_deg if given else settings.first_angle_deg
     if pair is not None:
         options.init_image_id1, options.init_image_id2 = pair[0] + 1, pair[1] + 1
         options.max_num_models = 1

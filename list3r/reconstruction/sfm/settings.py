@@ -133,14 +133,14 @@ class MappingSettings:
     """Largest error of an observation that stays."""
     first_angle_deg: float = 6.0
     """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
-    told_angle_deg: float = 3.0
-    """... where they are told, or the camera is to be found as well."""
-    told_steps: tuple[int, int] = (4, 7)
-    """Keyframes from the first to the second that are told, at least and at most."""
-    told: int = 2
-    """Pairs that are told at most, besides that of the mapper's own choice."""
+    given_angle_deg: float = field(default=3.0, metadata={"formerly": "told_angle_deg"})
+    """The same where the pair is given, or the camera is estimated as well."""
+    given_steps: tuple[int, int] = field(default=(4, 7), metadata={"formerly": "told_steps"})
+    """Fewest and most keyframes from the first to the second one of a given pair."""
+    given_pairs: int = field(default=2, metadata={"formerly": "told"})
+    """Most pairs from which a map is grown besides the one that the mapper chooses."""
     steady: float = 0.0
-    """... and none is where the depth of what is seen changes by less than this factor from each keyframe to the next;
+    """None is tried where the depth of what is seen changes by less than this factor from each keyframe to the next;
     0 for maps that are always compared with others."""
     same_error: float = 1.005
     """Two maps whose errors are that near are the same, and no third is grown: right ones of one chunk differ by 0.1 to
@@ -225,8 +225,8 @@ class CameraCalibrationSettings:
     most_window_ratio: float = 1.3
     """Windows whose own focal length is farther off the middle of all say nothing: theirs has too little parallax."""
     zoom_ratio: float = 1.5
-    """Windows whose focal length is farther off than this are told of: more than four deviations of one window. Windows
-    shorter than `frames` say too little for that."""
+    """Windows whose focal length is farther off than this are reported: more than four deviations of one window.
+    Windows shorter than `frames` say too little for that."""
     zoom_distortion: float = 0.2
     """... unless their k1 is farther off than this, see below."""
     most_error_px: float = 2.0

@@ -67,10 +67,10 @@ def as_bright(
         ranks = np.linspace(0.02, 0.98, 49)
         values = np.quantile(old[::8, ::8], ranks), np.quantile(new[::8, ::8], ranks)
     a, b = values
-    told = (a > _BLACK) & (a < _WHITE) & (b > _BLACK) & (b < _WHITE)
-    if told.sum() < _LEAST_TOLD:
+    usable = (a > _BLACK) & (a < _WHITE) & (b > _BLACK) & (b < _WHITE)
+    if usable.sum() < _LEAST_USABLE:
         return old
-    a, b = a[told], b[told]
+    a, b = a[usable], b[usable]
     kept, gain, offset = np.ones(len(a), bool), 1.0, 0.0
     for _ in range(3):
         middle_a, middle_b = a[kept].mean(), b[kept].mean()
@@ -92,7 +92,7 @@ _UNTOLD = 0.5
 """Most that brightness and contrast may leave of the difference that they are to explain."""
 _BLACK, _WHITE = 8.0, 247.0
 """Grey values beyond which a camera tells no difference."""
-_LEAST_TOLD = 12
+_LEAST_USABLE = 12
 """Fewest values that tell how brightness changed."""
 _GAINS = (0.25, 4.0)
 """Changes of contrast that are believed."""

@@ -1,4 +1,4 @@
-"""Find what was in one place for a part of a chunk only: surfaces that another frame saw through.
+"""Find movers in free space: surfaces that were in one place for a part of a chunk only, for another frame saw through.
 
 A point that frame i sees, and behind whose place frame j reads a surface, was not there at j. Frames spread evenly over
 the chunk are asked, so that a thing that is carried away is found in the frames before it moved as well. It needs poses
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.motion.settings import MovingSurfaceSettings
+from list3r.reconstruction.motion.settings import FreeSpaceMoverSettings
 from list3r.reconstruction.rgbd.view import Floats
 
 Mask = NDArray[np.bool_]
@@ -43,24 +43,23 @@ class SmallFrames:
     ) -> SmallFrames:
         """Thin out the depth images; those without depth are not posed."""
         stride = max(1, round(camera.width / width))
-        height, width = -(-camera.height // stride), -(-camera.width // stride)
-        depth = np.zeros((len(depths), height, width), np.float32)
+        small = camera.every(stride)
+        depth = np.zeros((len(depths), small.height, small.width), np.float32)
         for k, image in enumerate(depths):
             if image is not None:
                 depth[k] = image[::stride, ::stride]
         usable = posed & np.array([d is not None for d in depths], bool)
-        small = Camera(width, height, camera.fx / stride, camera.fy / stride, camera.cx / stride, camera.cy / stride)
         return SmallFrames(small, depth, T_chunk_cam, usable, stride)
 
 
-def find_moving(
-    frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: MovingSurfaceSettings | None = None
+def movers_in_free_space(
+    frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: FreeSpaceMoverSettings | None = None
 ) -> NDArray[np.bool_] | None:
     """Return what moves in each frame, at the size of the small frames; None where nothing does. Shape (F, h, w).
 
     `hints` are masks of any size by position: what the odometry found to move of its own.
     """
-    s, hints = settings or MovingSurfaceSettings(), hints or {}
+    s, hints = settings or FreeSpaceMoverSettings(), hints or {}
     ask = _References(frames, s)
     posed = np.flatnonzero(frames.posed).tolist()
     if not hints:
@@ -84,7 +83,7 @@ def find_moving(
 class _References:
     """The frames that are asked whether they saw through something."""
 
-    def __init__(self, frames: SmallFrames, settings: MovingSurfaceSettings) -> None:
+    def __init__(self, frames: SmallFrames, settings: FreeSpaceMoverSettings) -> None:
         self._frames, self._s = frames, settings
         posed = np.flatnonzero(frames.posed)
         chosen = np.unique(np.linspace(0, len(posed) - 1, min(settings.references, len(posed))).round().astype(int))
@@ -143,7 +142,7 @@ class _References:
         """Return which pixels were seen through, and which were seen to stay. Shapes (h, w), thinned out by `step`.
 
         Going away from the frame in time, what was seen through and is there again later was never seen through: so
-        a surface that reads badly, or a pose that is wrong, is told from a thing that came or went.
+        a surface that reads badly, or a pose that is wrong, is not taken for a thing that came or went.
         """
         if step == 1 and position in self._known:
             return self._known[position]
@@ -194,7 +193,7 @@ class _References:
         return inside & behind, seen & same, seen
 
 
-def _disagreement(apart: Floats, z: Floats, s: MovingSurfaceSettings) -> float:
+def _disagreement(apart: Floats, z: Floats, s: FreeSpaceMoverSettings) -> float:
     """Return by how much two frames disagree about what stands still, metres beyond noise: the error of their poses."""
     few = slice(None, None, max(1, len(apart) // 1000))
     near = np.abs(apart[few]) < s.near_share * z[few]
@@ -203,7 +202,7 @@ def _disagreement(apart: Floats, z: Floats, s: MovingSurfaceSettings) -> float:
     return max(0.0, float(np.median(np.abs(apart[few][near]) - s.noise.sigma(z[few][near]))))
 
 
-def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: MovingSurfaceSettings) -> Mask:
+def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: FreeSpaceMoverSettings) -> Mask:
     """The connected parts of a region of which a part of what was compared was seen through, and that do not lie in the
     midst of a surface that stays.
     """
@@ -226,7 +225,7 @@ def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, 
     return np.asarray(good[labels])
 
 
-def _whole(depth: Floats, s: MovingSurfaceSettings) -> Mask:
+def _whole(depth: Floats, s: FreeSpaceMoverSettings) -> Mask:
     """Pixels that no step of depth parts from their neighbours."""
     limit = np.float32(s.edge_share) * depth + 3 * s.noise.sigma(depth)
     whole = depth > 0

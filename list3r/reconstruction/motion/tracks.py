@@ -1,4 +1,4 @@
-"""Follow what moves from frame to frame, by place, size and colour, and tell what really went somewhere."""
+"""Track movers from frame to frame by place, size and colour, and drop those that went nowhere."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.reconstruction.motion.moving import SmallFrames
-from list3r.reconstruction.motion.settings import FollowSettings
+from list3r.reconstruction.motion.free_space import SmallFrames
+from list3r.reconstruction.motion.settings import MoverTrackSettings
 from list3r.reconstruction.rgbd.view import pixel_rays
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Blob:
-    """What moves in one frame, one thing of it."""
+    """One mover in one frame."""
 
     position: int
     """Of the frame in the chunk."""
@@ -37,28 +37,28 @@ class Blob:
 
 
 @dataclass
-class Followed:
-    """One thing over time."""
+class MoverTrack:
+    """One mover over time."""
 
     blobs: list[Blob] = field(default_factory=list)
     places: list[Array] = field(default_factory=list)
     """Middles of the blobs, chunk coordinates."""
 
 
-def follow_movers(
+def track_movers(
     masks: NDArray[np.bool_],
     colors: Sequence[NDArray[np.uint8]],
     times_s: Array,
     frames: SmallFrames,
-    settings: FollowSettings | None = None,
+    settings: MoverTrackSettings | None = None,
 ) -> NDArray[np.uint8] | None:
-    """Number the things that move: 0 for what stays, from 1 for things; None where nothing moves. Shape (F, h, w).
+    """Return the number of the mover at each pixel, from 1, 0 for what stays; None without any. Shape (F, h, w).
 
     `masks` (F, h, w) hold what may move; a blob that is seen in too few frames, or that goes nowhere, is left out.
     `colors` are the frames' pictures at any size, RGB.
     """
-    s = settings or FollowSettings()
-    tracks: list[Followed] = []
+    s = settings or MoverTrackSettings()
+    tracks: list[MoverTrack] = []
     for position in np.flatnonzero(masks.any(axis=(1, 2))).tolist():
         blobs = _blobs(masks[position], colors[position], frames, position, s)
         _assign(tracks, blobs, times_s, frames, s)
@@ -134,7 +134,7 @@ def _thickness(z: Array, row: NDArray[np.int64]) -> float:
 
 
 def _blobs(
-    mask: NDArray[np.bool_], color: NDArray[np.uint8], frames: SmallFrames, position: int, s: FollowSettings
+    mask: NDArray[np.bool_], color: NDArray[np.uint8], frames: SmallFrames, position: int, s: MoverTrackSettings
 ) -> list[Blob]:
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     parts = [labels == n for n in range(1, count)]
@@ -163,7 +163,7 @@ def _place(blob: Blob, frames: SmallFrames) -> Array:
 
 
 def _assign(
-    tracks: list[Followed], blobs: Sequence[Blob], times_s: Array, frames: SmallFrames, s: FollowSettings
+    tracks: list[MoverTrack], blobs: Sequence[Blob], times_s: Array, frames: SmallFrames, s: MoverTrackSettings
 ) -> None:
     """Give each blob to the track that expects it nearest, best pairs first; what is left begins a track."""
     pairs = []
@@ -188,19 +188,19 @@ def _assign(
             tracks[k].places.append(_place(blobs[n], frames))
     for n, blob in enumerate(blobs):
         if n not in given:
-            tracks.append(Followed([blob], [_place(blob, frames)]))
+            tracks.append(MoverTrack([blob], [_place(blob, frames)]))
 
 
-def _together(tracks: list[Followed], s: FollowSettings) -> list[Followed]:
+def _together(tracks: list[MoverTrack], s: MoverTrackSettings) -> list[MoverTrack]:
     """Tracks that keep beside each other in most frames of the shorter one are parts of one thing and its track."""
-    out: list[Followed] = []
+    out: list[MoverTrack] = []
     for track in sorted(tracks, key=lambda t: (-len(t.blobs), t.blobs[0].position)):
         if not any(_took_in(whole, track, s) for whole in out):
             out.append(track)
     return sorted(out, key=lambda t: t.blobs[0].position)
 
 
-def _took_in(whole: Followed, track: Followed, s: FollowSettings) -> bool:
+def _took_in(whole: MoverTrack, track: MoverTrack, s: MoverTrackSettings) -> bool:
     """Add a track to one beside which it keeps; whether it does."""
     by_frame = {b.position: n for n, b in enumerate(whole.blobs)}
     shared = [(b, by_frame[b.position]) for b in track.blobs if b.position in by_frame]
@@ -226,7 +226,7 @@ def _union(a: Blob, b: Blob) -> Blob:
     )
 
 
-def _expected(track: Followed, position: int, times_s: Array) -> Array:
+def _expected(track: MoverTrack, position: int, times_s: Array) -> Array:
     """Return where a track goes on to: half of its last speed, for things turn and stop."""
     if len(track.places) < 2:
         return track.places[-1]
@@ -235,7 +235,7 @@ def _expected(track: Followed, position: int, times_s: Array) -> Array:
     return np.asarray(track.places[-1] + 0.5 * step * min(float(times_s[position] - times_s[b]), 0.5))
 
 
-def _went(track: Followed, frames: SmallFrames, s: FollowSettings) -> bool:
+def _went(track: MoverTrack, frames: SmallFrames, s: MoverTrackSettings) -> bool:
     """Whether two of its places lie apart: by a part of its width, so that no change of view makes it seem so."""
     places = middles(track.blobs, frames.T_chunk_cam)
     if len(places) > 3:

@@ -1,4 +1,4 @@
-"""Find what moves of its own: a surface that disagrees with the motion that the rest of the picture determines.
+"""Find movers in residuals: surfaces that disagree with the motion that the rest of the picture determines.
 
 Two explanations, with and without a whole surface, are compared by a vote of pixels. A robust kernel over single pixels
 cannot tell a large near mover from the background: both agree half (decision 0063).
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from list3r.compiled import compiled
 from list3r.reconstruction.base import SensorNoise
-from list3r.reconstruction.motion.settings import MoverSettings
+from list3r.reconstruction.motion.settings import ResidualMoverSettings
 from list3r.reconstruction.rgbd.kernels import centred
 from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register, steps_without
 from list3r.reconstruction.rgbd.settings import OdometrySettings
@@ -42,7 +42,12 @@ class Fit:
 
 
 def fit(
-    model: Samples, view: WorkingFrame, mask: Mask, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
+    model: Samples,
+    view: WorkingFrame,
+    mask: Mask,
+    T_model_cam: Pose,
+    settings: ResidualMoverSettings,
+    noise: SensorNoise,
 ) -> Fit:
     """Mean cost inside and outside a mask."""
     cost, pixel = pixel_costs(model, view, T_model_cam, settings, noise)
@@ -54,7 +59,7 @@ def _split(cost: Floats, moving: Mask) -> Fit:
 
 
 def pixel_costs(
-    model: Samples, view: WorkingFrame, T_model_cam: Pose, settings: MoverSettings, noise: SensorNoise
+    model: Samples, view: WorkingFrame, T_model_cam: Pose, settings: ResidualMoverSettings, noise: SensorNoise
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Truncated squares of depth and brightness residuals in units of noise, summed, and the pixels they fall on."""
     camera = view.camera
@@ -112,7 +117,7 @@ def _residuals(
     return residual[:count], error[:count], pixel[:count]
 
 
-def surfaces(view: WorkingFrame, settings: MoverSettings, noise: SensorNoise) -> list[Mask]:
+def surfaces(view: WorkingFrame, settings: ResidualMoverSettings, noise: SensorNoise) -> list[Mask]:
     """Masks of the surfaces that are parted from their surroundings by steps of depth, largest first."""
     depth, area = view.depth, view.depth.size
     step = np.float32(settings.depth_step) * depth + 3 * noise.sigma(depth)
@@ -136,7 +141,7 @@ def without(view: WorkingFrame, mask: Mask) -> WorkingFrame:
     return replace(view, valid=view.valid & ~mask)
 
 
-def find_mover(
+def mover_in_residuals(
     model: Samples,
     view: WorkingFrame,
     T_guess: Pose,
@@ -199,7 +204,7 @@ def suspects(model: Samples, view: WorkingFrame, found: FrameRegistration, odome
 class MoverMemory:
     """What moved in the last frame, carried to the next until it has stood still."""
 
-    def __init__(self, settings: MoverSettings, noise: SensorNoise) -> None:
+    def __init__(self, settings: ResidualMoverSettings, noise: SensorNoise) -> None:
         self._settings, self._noise = settings, noise
         self.mask: Mask | None = None
         """What moves in the last frame that was followed."""
