@@ -130,8 +130,37 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
         similar(reader, vector=asked[0], space=SPACE, k=10)
         row["similar_first_again_s"] = round(time.perf_counter() - started[0], 2)
         row["similar_first_again_cpu_s"] = round(time.process_time() - started[1], 2)
+    row |= cold(path, points)
     row["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, 1)
     return row
+
+
+def cold(path: Path, points: Floats) -> dict[str, float]:
+    """`nearest` in a memory just opened, of whose file nothing is in the system's cache: once at the start, or before
+    each question, when only what SQLite keeps is left of those before.
+    """
+    out: dict[str, float] = {}
+    for name, each in (("nearest_cold", False), ("nearest_cold_each", True)):
+        leave_cache(path)
+        with Store.open(path) as store:
+
+            def ask(p: Floats, store: Store = store) -> Any:
+                return nearest(store, point=p, k=5)
+
+            out |= timed(f"{name}_first", [lambda ask=ask: ask(points[0])], warm=0)
+            drop = (lambda: leave_cache(path)) if each else (lambda: None)
+            out |= timed(name, [lambda p=p, ask=ask: ask(p) for p in points[1:]], warm=0, before=drop)
+    return out
+
+
+def leave_cache(path: Path) -> None:
+    """Let the system forget what it keeps of a file."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+        os.posix_fadvise(file, 0, 0, os.POSIX_FADV_DONTNEED)
+    finally:
+        os.close(file)
 
 
 # ---------------------------------------------------------------------------------------------- what is written
@@ -322,12 +351,16 @@ def recall(found: dict[int, list[int]], truth: dict[int, list[int]]) -> float:
     return round(float(np.mean([len(set(found[n]) & set(t)) / len(t) for n, t in truth.items()])), 4)
 
 
-def timed(name: str, questions: list[Callable[[], Any]], warm: int = 3) -> dict[str, float]:
+def timed(
+    name: str, questions: list[Callable[[], Any]], warm: int = 3, before: Callable[[], None] = lambda: None
+) -> dict[str, float]:
     """p50 and p99 of single questions, milliseconds by the clock and of processor time, after a few to warm up that are
-    asked once more. The clock counts what else the machine does; the processor's time what the question costs.
+    asked once more. The clock counts what else the machine does; the processor's time what the question costs. What
+    comes `before` each is not counted.
     """
     spent = []
     for n, ask in enumerate([*questions[:warm], *questions]):
+        before()
         started = time.perf_counter(), time.process_time()
         ask()
         if n >= warm:

@@ -177,9 +177,8 @@ def measured_walk(relations: Sequence[FrameRelations]) -> Array:
         third = len(r.frames) // 3
         if len(r.frames) < _LEAST_FRAMES:
             continue
-        parts = [slice(k * third, (k + 1) * third) for k in range(3)]
-        middle = np.array([np.median(r.off[part], axis=0) for part in parts])
-        time = np.array([r.frames[part].mean() for part in parts])
+        middle = np.median(r.off[: 3 * third].reshape(3, third, 7), axis=1)
+        time = r.frames[: 3 * third].reshape(3, third).mean(axis=1)
         square = np.diff(middle, axis=0) ** 2 / (2.0 * np.diff(time)[:, None])
         found.append([square[:, :3].mean(), square[:, 3:6].mean(), square[:, 6].mean()])
     return np.mean(found, axis=0) if found else np.zeros(3)

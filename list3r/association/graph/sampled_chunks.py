@@ -61,6 +61,7 @@ class SampledChunks:
         derived = Derived() if store is None else store.derived
         self._nodes, self._relations, self._held = derived.of(_Nodes), derived.of(_Relations), derived.of(_Samples)
         self._ties = derived.of(_Ties)
+        self._stamps: dict[int, int] = {}
 
     @staticmethod
     def of(store: Store) -> SampledChunks:
@@ -97,7 +98,9 @@ class SampledChunks:
         return found if found is not None else self._ties.put(key, tuple(ties_of(relations, edge, *nodes, settings)))
 
     def _stamp(self, chunk: int) -> int:
-        return 0 if self._store is None else self._store.chunks.checksum(chunk)
+        if chunk not in self._stamps:
+            self._stamps[chunk] = 0 if self._store is None else self._store.chunks.checksum(chunk)
+        return self._stamps[chunk]
 
     def _samples(self, chunk: int) -> FrameSamples:
         """Return the samples of a chunk without frames whose pose is not finite."""

@@ -49,7 +49,7 @@ class Reference:
 
     def corrected(self, lab: Sequence[float]) -> tuple[float, float, float]:
         """Return a colour as it would look in white light that shows white as white."""
-        gain = float(np.clip(_FULL_WHITE_L / max(self.white_l, 1e-6), 1.0, _MAX_GAIN))
+        gain = min(max(_FULL_WHITE_L / max(self.white_l, 1e-6), 1.0), _MAX_GAIN)
         lightness, share = min(100.0, lab[0] * gain), min(1.0, lab[0] / max(self.white_l, 1e-6))
         return lightness, gain * (lab[1] - share * self.cast_ab[0]), gain * (lab[2] - share * self.cast_ab[1])
 
@@ -110,7 +110,15 @@ def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]
 
 def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -> tuple[str, tuple[int, int, int]]:
     """Return (name, RGB as seen) of the colour that most of an instance has, shades of one name counted together."""
-    names = [color_name(s.lab, reference) for s in swatches]
+    return _main_of(swatches, color_names(swatches, reference))
+
+
+def color_names(swatches: Sequence[Swatch], reference: Reference | None = None) -> list[str]:
+    """Return the name of each colour of an instance."""
+    return [color_name(s.lab, reference) for s in swatches]
+
+
+def _main_of(swatches: Sequence[Swatch], names: Sequence[str]) -> tuple[str, tuple[int, int, int]]:
     weight = [s.share * (_DARK_WEIGHT if s.lab[0] < _DARK_L else 1.0) for s in swatches]
     total = {n: sum(w for m, w in zip(names, weight, strict=True) if m == n) for n in names}
     best = max(range(len(names)), key=lambda k: (total[names[k]], weight[k], -k))
@@ -119,16 +127,16 @@ def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -
 
 def color_words(swatches: Sequence[Swatch], reference: Reference | None = None) -> str:
     """Return the name of the main colour, or "red and white" where two clearly different ones share an instance."""
-    name, _ = main_color(swatches, reference)
-    share = {n: 0.0 for n in (color_name(s.lab, reference) for s in swatches)}
-    for s in swatches:
-        share[color_name(s.lab, reference)] += s.share
+    names = color_names(swatches, reference)
+    name, _ = _main_of(swatches, names)
+    share = dict.fromkeys(names, 0.0)
+    for s, n in zip(swatches, names, strict=True):
+        share[n] += s.share
     others = [(part, n) for n, part in share.items() if n != name and _kind(n) != _kind(name)]
     if not others or max(others)[0] < 0.3 or share[name] + max(others)[0] < 0.75:
         return name
     other = max(others)[1]
-    one = np.mean([s.lab for s in swatches if color_name(s.lab, reference) == name], axis=0)
-    two = np.mean([s.lab for s in swatches if color_name(s.lab, reference) == other], axis=0)
+    one, two = (np.mean([s.lab for s, n in zip(swatches, names, strict=True) if n == m], axis=0) for m in (name, other))
     return f"{name} and {other}" if float(np.linalg.norm(one - two)) > 40.0 else name
 
 

@@ -68,6 +68,9 @@ def consolidate(
         return ConsolidationReport(0, 0, (), (), 0)
     ended, last = chunk_id is None, chunks[-1].chunk_id if chunk_id is None else chunk_id
     summaries, before = chunk_summaries(store, s.shapes, hold=True), store.library.settled.all()
+    if not ended:
+        summaries.keep_sample()
+        summaries.end_turn()
     ledger = read_ledger(store, chunks)
     carried = _carry(store, summaries, s) if ended and ledger is not None else None
     known = store.facts[WORLD]
@@ -201,9 +204,5 @@ def _describe_anew(region: Region) -> None:
     """Write the words for instances in the light of the world as it is now, where they are others."""
     store, metric = region.store, region.store.facts.scale_kind != "relative"
     known = {looks.instance: looks for looks in store.library.looks.all()}
-    before = store.instances.all()
-    after = [in_light(i, known[i.id], region.world, metric=metric) for i in before]
-    words = [
-        (a, (a.description, a.color_name) != (b.description, b.color_name)) for a, b in zip(after, before, strict=True)
-    ]
-    store.instances.put(a for a, others in words if others)
+    told = (in_light(i, known[i.id], region.world, metric=metric) for i in store.instances.all())
+    store.instances.put(i for i in told if i is not None)

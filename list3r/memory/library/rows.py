@@ -95,13 +95,15 @@ def looks_of(found: DerivedInstance) -> Looks:
     return Looks(found.geometry.id, found.shape, found.resting, colors)
 
 
-def in_light(instance: Instance, looks: Looks, world: World, *, metric: bool) -> Instance:
-    """Return an instance with the words for it in the light of the world."""
+def in_light(instance: Instance, looks: Looks, world: World, *, metric: bool) -> Instance | None:
+    """Return an instance with the words for it in the light of the world; None where it has them."""
     rows = looks.swatches.tolist()
     swatches = tuple(Swatch((int(r), int(g), int(b)), (x, y, z), share) for r, g, b, x, y, z, share in rows)
     look = _Look(looks.shape, looks.resting, swatches)
     name, rgb = main_color(swatches, world.light)
     words = _description(look, instance.box.size, instance.structure, world, metric=metric)
+    if (words, name) == (instance.description, instance.color_name):
+        return None
     return replace(instance, description=words, color_name=name, color_rgb=rgb)
 
 
@@ -127,12 +129,20 @@ def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[i
         instances = store.instances.of(some)
         before = stack([others[i.id].S_exact_settled for i in instances])
         now = stack([exact[others[i.id].chunk_id] for i in instances])
-        by = now.apply(before.inverse().apply(_centers(instances)[:, None]))[:, 0] - _centers(instances)
+        center = _centers(instances)
+        by = now.apply(before.inverse().apply(center[:, None]))[:, 0] - center
+        sigma = _sigmas(store, some, center + by)
         there = [
-            replace(i, center=i.center + d, aabb=i.aabb + d, box=replace(i.box, center=i.box.center + d))
-            for i, d in zip(instances, by, strict=True)
+            replace(
+                i,
+                center=i.center + d,
+                aabb=i.aabb + d,
+                box=replace(i.box, center=i.box.center + d),
+                position_sigma_m=s,
+            )
+            for i, d, s in zip(instances, by, sigma, strict=True)
         ]
-        store.instances.put(with_sigma(store, there))
+        store.instances.put(there)
     store.library.anchors.put({n: Anchor(a.chunk_id, exact[a.chunk_id]) for n, a in others.items()})
 
 
@@ -155,20 +165,22 @@ def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None
         half = by.scale[:, None] * np.ptp(aabb, axis=1) / 2.0 * now / np.maximum(before, 1e-12)
         middle = by.apply(aabb.mean(axis=1)[:, None] + derived - center)
         boxes = np.concatenate([middle - half[:, None], middle + half[:, None]], axis=1)
-        rows = zip(instances, by.apply(derived)[:, 0], boxes, by.scale[:, None] * size, turned, strict=True)
-        there = [replace(i, center=c, aabb=a, box=OrientedBox(c, edges, R)) for i, c, a, edges, R in rows]
-        store.instances.put(with_sigma(store, there))
+        there = by.apply(derived)[:, 0]
+        rows = zip(instances, there, boxes, by.scale[:, None] * size, turned, _sigmas(store, some, there), strict=True)
+        store.instances.put(
+            replace(i, center=c, aabb=a, box=OrientedBox(c, edges, R), position_sigma_m=s)
+            for i, c, a, edges, R, s in rows
+        )
     store.library.anchors.put({n: Anchor(a.chunk_id, Sim3.identity()) for n, a in anchors.items()})
 
 
-def with_sigma(store: Store, instances: Sequence[Instance]) -> list[Instance]:
-    """Return instances with how well it is known where they are, by all chunks that saw them and take part."""
-    at, redundant = {i.id: n for n, i in enumerate(instances)}, store.library.redundant.chunks()
+def _sigmas(store: Store, ids: Sequence[int], centers: Array) -> list[float | None]:
+    """Return how well it is known where instances are, by all chunks that saw them and take part."""
+    at, redundant = {i: n for n, i in enumerate(ids)}, store.library.redundant.chunks()
     seen = [(at[i], k) for i, k in store.observations.chunks_of(sorted(at)) if k not in redundant]
     owner, chunk = np.array(seen, np.int64).reshape(-1, 2).T
-    ids, number = np.unique(chunk, return_inverse=True)
-    sigma = position_sigmas(_centers(instances), owner, number, [store.chunks.get(int(k)) for k in ids])
-    return [replace(i, position_sigma_m=s) for i, s in zip(instances, sigma, strict=True)]
+    numbers, number = np.unique(chunk, return_inverse=True)
+    return position_sigmas(centers, owner, number, [store.chunks.get(int(k)) for k in numbers])
 
 
 _ROUNDED = 1e-9

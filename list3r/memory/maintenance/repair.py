@@ -23,7 +23,7 @@ from list3r.memory.store.checksums import (
     row_crc,
     stored_sums,
     summed_tables,
-    write_part,
+    write_table,
 )
 from list3r.memory.store.file import (
     check_beside,
@@ -203,8 +203,7 @@ def _drop_bad_rows(database: sqlite3.Connection, version: int, lost: _Lost) -> N
         elif table is not None:
             lost.unnamed[bad.table] = lost.unnamed.get(bad.table, 0) + 1
     for name, table in tables.items():
-        for (part,) in database.execute(f"SELECT DISTINCT {table.part_of(name)} FROM {name}").fetchall():
-            write_part(database, table, part)
+        write_table(database, table)
         database.execute(
             f"DELETE FROM sums WHERE name = ? AND part NOT IN (SELECT {table.part_of(name)} FROM {name})", (name,)
         )
@@ -303,7 +302,7 @@ def _readable(damaged: sqlite3.Connection, table: SummedTable, parts: list[int])
         if whole:
             return
     for part in parts:
-        clause, arguments = table.where(part)
+        clause, arguments = table.where(range(part, part + 1))
         with contextlib.suppress(*FAILURES):
             for _, *row in damaged.execute(f"{select} WHERE {clause}", arguments):
                 yield part, tuple(row[k] for k in keys), tuple(row)

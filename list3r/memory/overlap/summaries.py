@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.planes import Planes, chunk_planes
-from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, read_every, with_samples
+from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, ShapeSettings, chunk_shapes, read_every, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
+
+T = TypeVar("T")
 
 ROOM_DEPTH_M = 2.0
 """How far instances are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
@@ -59,6 +62,8 @@ class SampledChunk:
 _KEPT_BYTES = 48 << 20
 """Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
 with chunks. Of a chunk with 12 instances it takes 0.2 MB, of one with 50 a megabyte."""
+_KEPT_TURNS = 16
+"""Chunks that come until a summary that none of them asked for is dropped: a walk leaves most of a house behind."""
 _SAMPLED = 64
 """Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
 
@@ -75,7 +80,7 @@ class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None, frozenset[int]
     """Summaries by chunk id, checksum of what the chunk measured, settings, and local instances that are left out."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, _bytes_of)
+        super().__init__(_KEPT_BYTES, _bytes_of, _KEPT_TURNS)
 
 
 _HELD_BYTES = 256 << 20
@@ -96,6 +101,8 @@ class SampledCache(LruCache[tuple[int, int], SampledChunk]):
 
     def __init__(self) -> None:
         super().__init__(_SAMPLED * 2)
+        self.newest = -1
+        """The last chunk of the sample that is kept."""
 
 
 class Summaries(Mapping[int, ChunkSummary]):
@@ -144,6 +151,19 @@ class Summaries(Mapping[int, ChunkSummary]):
         known, key = self._store.derived.of(SampledCache), (chunk_id, self._checksum(chunk_id))
         return known.get(key) or known.put(key, self[chunk_id].sampled)
 
+    def keep_sample(self) -> None:
+        """Keep what the sampled chunks of a long memory tell while they are at hand: a session's end asks for it."""
+        known, sample = self._store.derived.of(SampledCache), sample_of(self._ids)
+        if len(self._ids) > _SAMPLED and sample[-1] != known.newest:
+            for chunk_id in sample:
+                self.sampled(chunk_id)
+            known.newest = sample[-1]
+
+    def end_turn(self) -> None:
+        """Drop what none of the last chunks asked for."""
+        self._known.end_turn()
+        self._store.derived.of(GrownCells).end_turn()
+
     def _checksum(self, chunk_id: int) -> int:
         if chunk_id not in self._checked:
             self._checked[chunk_id] = self._store.chunks.checksum(chunk_id)
@@ -186,9 +206,12 @@ def chunk_summaries(store: Store, settings: ShapeSettings | None = None, *, hold
     return Summaries(store, settings or stored_settings(store, ShapeSettings, "library", "shapes"), hold=hold)
 
 
-def sample_of(chunks: Sequence[ChunkRow]) -> list[ChunkRow]:
-    """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is decided by them."""
-    step = max(1, -(-len(chunks) // _SAMPLED))
+def sample_of(chunks: Sequence[T]) -> list[T]:
+    """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is decided by them.
+
+    Of more chunks it is some of them and later ones.
+    """
+    step = 1 << ((len(chunks) - 1) // _SAMPLED).bit_length() if chunks else 1
     return list(chunks[::step])
 
 

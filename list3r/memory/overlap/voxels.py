@@ -329,6 +329,8 @@ def lies_on(points: Array, target: ChunkShapes) -> NDArray[np.bool_]:
 
 _KEPT_BYTES = 32 << 20
 """Those of some 70 chunks with a dozen things: of a place that many sessions saw, all are asked for with each chunk."""
+_KEPT_TURNS = 16
+"""Chunks that come until cells that none of them asked for are dropped."""
 
 
 @dataclass(frozen=True)
@@ -346,7 +348,7 @@ class GrownCells(LruCache[int, _Grown]):
     """Grown cells of the chunks that were compared last: they take more memory than all else of a chunk."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, lambda grown: grown.keys.nbytes + grown.owner.nbytes)
+        super().__init__(_KEPT_BYTES, lambda grown: grown.keys.nbytes + grown.owner.nbytes, _KEPT_TURNS)
 
     def of(self, shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
         """Return the keys of the cells within the tolerance of each instance, and their instances. Shape (G,) each."""

@@ -33,6 +33,8 @@ _ROWS_OF_A_PART = 4
 """Two to the power of this: how many neighbouring ids share a part."""
 _FRAMES_OF_A_PART = 6
 _SESSION_BITS = 32
+_PARTS = 1_000
+"""Parts that are read together."""
 
 Row = tuple[Any, ...]
 
@@ -71,19 +73,17 @@ class SummedTable:
         """`part` over the columns of a named row."""
         return self.part.replace("%s", row)
 
-    def where(self, part: int) -> tuple[str, tuple[int, ...]]:
-        """A condition that holds for the rows of a part and that the primary key can answer."""
-        first = self.key[0]
+    def where(self, parts: range) -> tuple[str, tuple[int, ...]]:
+        """A condition that holds for the rows of parts side by side and that the primary key can answer."""
+        first, last = parts[0], parts[-1]
         if self.name == "frames":
-            low = (part & (1 << _SESSION_BITS) - 1) << _FRAMES_OF_A_PART
-            clause = "session_id = ? AND frame_index BETWEEN ? AND ?"
-            return clause, (part >> _SESSION_BITS, low, low + (1 << _FRAMES_OF_A_PART) - 1)
-        if first == "chunk_id" and len(self.key) > 1:
-            return "chunk_id = ?", (part,)
+            numbers = (1 << _SESSION_BITS) - 1
+            frames = (first & numbers) << _FRAMES_OF_A_PART, ((last & numbers) + 1 << _FRAMES_OF_A_PART) - 1
+            return "session_id = ? AND frame_index BETWEEN ? AND ?", (first >> _SESSION_BITS, *frames)
         if not self.numbered:
             return "1", ()
-        low = part << _ROWS_OF_A_PART
-        return f"{first} BETWEEN ? AND ?", (low, low + (1 << _ROWS_OF_A_PART) - 1)
+        bits = 0 if self.key[0] == "chunk_id" and len(self.key) > 1 else _ROWS_OF_A_PART
+        return f"{self.key[0]} BETWEEN ? AND ?", (first << bits, (last + 1 << bits) - 1)
 
 
 @dataclass(frozen=True)
@@ -144,13 +144,13 @@ class Sums:
 
     def damaged_before(self, committed: sqlite3.Connection) -> Iterator[BadRow]:
         """Rows of the parts that were touched that were damaged before, in the file as it was last committed."""
-        for name, part in sorted(self._touched):
-            yield from bad_rows_of_part(committed, summed_tables()[name], part)
+        for name, parts in side_by_side(self._touched):
+            yield from bad_rows_of(committed, summed_tables()[name], parts)
 
     def write(self) -> None:
         """Sum what was touched since the last call; inside the transaction that touched it."""
-        for name, part in sorted(self._touched):
-            write_part(self._database, summed_tables()[name], part)
+        for name, parts in side_by_side(self._touched):
+            write_parts(self._database, summed_tables()[name], parts)
         self._touched.clear()
 
     def forget(self) -> None:
@@ -163,25 +163,43 @@ class Sums:
         return bool(self._touched)
 
 
-def write_part(database: sqlite3.Connection, table: SummedTable, part: int) -> None:
-    """Sum one part of a table again."""
-    clause, arguments = table.where(part)
-    query = f"SELECT {', '.join(table.summed)} FROM {table.name} WHERE {clause} ORDER BY {', '.join(table.key)}"
-    crcs = b"".join(row_crc(row) for row in database.execute(query, arguments))
-    if crcs:
-        sealed = crcs + _seal(table.name, part, crcs)
-        database.execute("INSERT OR REPLACE INTO sums VALUES (?, ?, ?)", (table.name, part, sealed))
-    else:
-        database.execute("DELETE FROM sums WHERE name = ? AND part = ?", (table.name, part))
+def write_parts(database: sqlite3.Connection, table: SummedTable, parts: range) -> None:
+    """Sum some parts of a table side by side again."""
+    held = {part: (name, part, sealed) for name, part, sealed in _sealed(database, table, parts)}
+    database.executemany("INSERT OR REPLACE INTO sums VALUES (?, ?, ?)", held.values())
+    gone = [(table.name, part) for part in parts if part not in held]
+    database.executemany("DELETE FROM sums WHERE name = ? AND part = ?", gone)
+
+
+def _sealed(
+    database: sqlite3.Connection, table: SummedTable, parts: range | None = None
+) -> Iterator[tuple[str, int, bytes]]:
+    """Rows of `sums` of a table, or of some of its parts side by side."""
+    for part, rows in groupby(_rows_of(database, table, parts), key=lambda row: row[-1]):
+        crcs = b"".join(row_crc(row[:-1]) for row in rows)
+        yield table.name, part, crcs + _seal(table.name, part, crcs)
+
+
+def _rows_of(database: sqlite3.Connection, table: SummedTable, parts: range | None) -> Iterator[Row]:
+    """What is summed of the rows of a table, or of some of its parts side by side, in order, each with its part."""
+    clause, arguments = ("1", ()) if parts is None else table.where(parts)
+    return database.execute(
+        f"SELECT {', '.join(table.summed)}, {table.part_of(table.name)} FROM {table.name}"
+        f" WHERE {clause} ORDER BY {', '.join(table.key)}",
+        arguments,
+    )
 
 
 def write_all(database: sqlite3.Connection) -> None:
     """Sum every row again: after a migration, or when a file is made of the sound rows of another."""
     database.execute("DELETE FROM sums")
     for table in summed_tables().values():
-        parts = database.execute(f"SELECT DISTINCT {table.part_of(table.name)} FROM {table.name}").fetchall()
-        for (part,) in parts:
-            write_part(database, table, part)
+        write_table(database, table)
+
+
+def write_table(database: sqlite3.Connection, table: SummedTable) -> None:
+    """Sum every row of a table again."""
+    database.executemany("INSERT OR REPLACE INTO sums VALUES (?, ?, ?)", _sealed(database, table))
 
 
 def row_crc(row: Row) -> bytes:
@@ -194,11 +212,32 @@ def row_crc(row: Row) -> bytes:
     return value.to_bytes(4, "little")
 
 
-def stored_sums(database: sqlite3.Connection, table: SummedTable) -> tuple[dict[int, list[bytes]], list[int]]:
-    """Sums of a table's rows by part, and the parts whose sums are damaged themselves."""
+def side_by_side(parts: Iterable[tuple[str, int]]) -> Iterator[tuple[str, range]]:
+    """Parts of tables in order, those that lie side by side together, `_PARTS` at the most.
+
+    Parts that are no numbers are left out: they are of rows that no program of ours writes.
+    """
+    start, count = ("", 0), 0
+    for name, part in sorted(p for p in parts if isinstance(p[1], int)):
+        if count and (name, part) == (start[0], start[1] + count) and count < _PARTS:
+            count += 1
+            continue
+        if count:
+            yield start[0], range(start[1], start[1] + count)
+        start, count = (name, part), 1
+    if count:
+        yield start[0], range(start[1], start[1] + count)
+
+
+def stored_sums(
+    database: sqlite3.Connection, table: SummedTable, parts: range | None = None
+) -> tuple[dict[int, list[bytes]], list[int]]:
+    """Sums of a table's rows by part, of all or of some parts side by side, and those whose sums are damaged."""
     good: dict[int, list[bytes]] = {}
     bad: list[int] = []
-    for part, sealed in database.execute("SELECT part, crcs FROM sums WHERE name = ? ORDER BY part", (table.name,)):
+    clause, arguments = ("1", ()) if parts is None else ("part BETWEEN ? AND ?", (parts[0], parts[-1]))
+    query = f"SELECT part, crcs FROM sums WHERE name = ? AND {clause} ORDER BY part"
+    for part, sealed in database.execute(query, (table.name, *arguments)):
         crcs = _unsealed(table.name, part, sealed)
         if crcs is None:
             bad.append(part)
@@ -225,37 +264,18 @@ def bad_rows(database: sqlite3.Connection, version: int = SCHEMA_VERSION) -> Ite
         yield from bad_rows_of(database, table)
 
 
-def bad_rows_of(database: sqlite3.Connection, table: SummedTable) -> Iterator[BadRow]:
-    """`bad_rows` of one table."""
-    sums, broken = stored_sums(database, table)
+def bad_rows_of(database: sqlite3.Connection, table: SummedTable, parts: range | None = None) -> Iterator[BadRow]:
+    """`bad_rows` of one table, or of some of its parts side by side."""
+    sums, broken = stored_sums(database, table, parts)
     for part in broken:
         yield BadRow("sums", (table.name, part), "the checksums of these rows are damaged")
-    keys = len(table.key)
-    query = (
-        f"SELECT {', '.join(table.key)}, {table.part_of(table.name)}, {', '.join(table.summed)} FROM {table.name}"
-        f" ORDER BY {', '.join(table.key)}"
-    )
-    for part, rows in groupby(database.execute(query), key=lambda row: row[keys]):
-        found = [(row[:keys], row_crc(row[keys + 1 :])) for row in rows]
+    keys = [table.summed.index(column) for column in table.key]
+    for part, rows in groupby(_rows_of(database, table, parts), key=lambda row: row[-1]):
+        found = [(tuple(row[k] for k in keys), row_crc(row[:-1])) for row in rows]
         if part not in broken:
             yield from compare(table.name, found, sums.pop(part, []))
     for crcs in sums.values():
         yield BadRow(table.name, None, _missing(len(crcs)))
-
-
-def bad_rows_of_part(database: sqlite3.Connection, table: SummedTable, part: int) -> Iterator[BadRow]:
-    """`bad_rows` of one part of a table."""
-    sealed = database.execute("SELECT crcs FROM sums WHERE name = ? AND part = ?", (table.name, part)).fetchall()
-    written = _unsealed(table.name, part, sealed[0][0]) if sealed else []
-    if written is None:
-        yield BadRow("sums", (table.name, part), "the checksums of these rows are damaged")
-        return
-    clause, arguments = table.where(part)
-    keys = len(table.key)
-    names = ", ".join((*table.key, *table.summed))
-    query = f"SELECT {names} FROM {table.name} WHERE {clause} ORDER BY {', '.join(table.key)}"
-    found = [(row[:keys], row_crc(row[keys:])) for row in database.execute(query, arguments)]
-    yield from compare(table.name, found, written)
 
 
 def compare(table: str, found: list[tuple[Row, bytes]], written: list[bytes]) -> Iterator[BadRow]:

@@ -27,12 +27,15 @@ class Derived:
 
 
 class LruCache(Generic[K, V]):
-    """Values that were asked for last; those used longest ago are dropped when all together exceed a limit."""
+    """Values that were asked for last; those used longest ago are dropped when all together exceed a limit, and at the
+    end of a turn, where there are turns, those that nobody asked for in the last `turns`."""
 
-    def __init__(self, limit: int, size: Callable[[V], int] | None = None) -> None:
-        self._limit, self._size = limit, size or (lambda value: 1)
+    def __init__(self, limit: int, size: Callable[[V], int] | None = None, turns: int = 0) -> None:
+        self._limit, self._size, self._turns = limit, size or (lambda value: 1), turns
         self._values: OrderedDict[K, tuple[int, V]] = OrderedDict()
-        self._held = 0
+        self._asked: dict[K, int] = {}
+        """In which turn each value was asked for last."""
+        self._held = self._turn = 0
 
     def __len__(self) -> int:
         return len(self._values)
@@ -42,13 +45,26 @@ class LruCache(Generic[K, V]):
         if key not in self._values:
             return None
         self._values.move_to_end(key)
+        self._asked[key] = self._turn
         return self._values[key][1]
 
     def put(self, key: K, value: V) -> V:
         """Keep a value, at least until the next one comes, and return it."""
         self._held -= self._values.pop(key, (0, value))[0]
         self._values[key] = (self._size(value), value)
+        self._asked[key] = self._turn
         self._held += self._values[key][0]
         while self._held > self._limit and len(self._values) > 1:
-            self._held -= self._values.popitem(last=False)[1][0]
+            self._drop_oldest()
         return value
+
+    def end_turn(self) -> None:
+        """Drop what was not asked for in the last turns."""
+        self._turn += 1
+        while self._values and self._asked[next(iter(self._values))] < self._turn - self._turns:
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        key, (size, _) = self._values.popitem(last=False)
+        del self._asked[key]
+        self._held -= size

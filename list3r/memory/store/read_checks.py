@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, bad_rows_of_part, own_crc_wrong, row_crc, summed_tables
+from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, own_crc_wrong, row_crc, side_by_side, summed_tables
 from list3r.memory.store.rows.values import bad_references, bad_values
 from list3r.memory.store.word_index import expected_words, up_to_date
 
@@ -95,7 +95,7 @@ class ReadChecks:
         """The first damage of the parts of a table that rows with these first keys lie in."""
         if self.damage is None and self.by_part(table):
             fresh = {(table, summed_tables()[table].part_of_first(int(k))) for k in keys} - self._sound_parts
-            self.damage = self._found(sorted(fresh))
+            self.damage = self._found([*side_by_side(fresh)])
         return self.damage
 
     def keep_sound(self, table: str, ids: Iterable[int]) -> None:
@@ -110,7 +110,7 @@ class ReadChecks:
         kept = self._sound_rows.get(table, set[int]())
         return [n for n in ids if n not in kept]
 
-    def _found(self, names: Sequence[str] | Sequence[tuple[str, int]]) -> str | None:
+    def _found(self, names: Sequence[str] | Sequence[tuple[str, range]]) -> str | None:
         """The first damage of tables, or of parts of tables."""
         database = self._database if self._committed is None else self._committed()
         self._busy, opened = True, not database.in_transaction
@@ -119,13 +119,13 @@ class ReadChecks:
             if opened:
                 database.execute("BEGIN")
             for name in names:
-                for text in damage_of(database, name) if isinstance(name, str) else damage_of_part(database, *name):
+                for text in damage_of(database, name) if isinstance(name, str) else damage_of_parts(database, *name):
                     return text
                 if isinstance(name, str):
                     self._checked.add(name)
                     self._read.discard(name)
                 else:
-                    self._sound_parts.add(name)
+                    self._sound_parts.update((name[0], part) for part in name[1])
             return None
         except FAILURES as error:
             return str(error)
@@ -154,13 +154,14 @@ def damage_of(database: sqlite3.Connection, name: str, *, pages: bool = True) ->
     yield from bad_references(database, name)
 
 
-def damage_of_part(database: sqlite3.Connection, name: str, part: int) -> Iterator[str]:
-    """Every damage of one part of a table: its sums and its blobs."""
+def damage_of_parts(database: sqlite3.Connection, name: str, parts: range) -> Iterator[str]:
+    """Every damage of some parts of a table side by side: their sums and their blobs."""
     table = summed_tables()[name]
-    yield from map(str, bad_rows_of_part(database, table, part))
+    where = table.where(parts)
+    yield from map(str, bad_rows_of(database, table, parts))
     if name in OWN_CRC:
-        yield from map(str, own_crc_wrong(database, name, table.key, table.where(part)))
-    yield from map(str, bad_values(database, name, *table.where(part)))
+        yield from map(str, own_crc_wrong(database, name, table.key, where))
+    yield from map(str, bad_values(database, name, *where))
 
 
 def _large(database: sqlite3.Connection) -> set[str]:

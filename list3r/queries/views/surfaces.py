@@ -81,7 +81,8 @@ def _surface(store: Store, instance: Instance) -> InstanceSurface:
     """Return the support points inside the box, as deriving the box left strays out; those just outside are moved to
     its side, so that a thing is never nearer than its box.
     """
-    points = inside_box(store.surfaces.points(instance.id).astype(np.float64), instance)
+    points = store.surfaces.points(instance.id).astype(np.float64)
+    points = inside_box(points, instance) if len(points) else points
     if len(points) == 0:
         return InstanceSurface(None, instance)
     low, high = instance.aabb

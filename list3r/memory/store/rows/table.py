@@ -129,6 +129,8 @@ class Table(Generic[R]):
 
     def _records(self, query: str, arguments: Arguments) -> list[R]:
         rows = self._connection.rows(query, arguments)
+        if not rows:
+            return []
         if self._checked:
             rows = self._connection.believed(self._name, rows)
         for table in self._parts:

@@ -22,6 +22,8 @@ _MOST_TEXT = 4000
 _MOST_JSON = 64 * 2**20
 _MOST_CELL = 16 * 2**20
 """Bytes of a value that is looked into as a whole."""
+_NUMBER = np.dtype("<f4")
+"""Of vectors."""
 _MOST_LENGTH = 1e7
 """World units that anything may be away or long."""
 _MOST_LOG_SCALE = 20.0
@@ -484,7 +486,7 @@ def _is_box(blob: bytes) -> bool:
 
 
 def _is_vector(blob: bytes) -> bool:
-    return len(blob) > 0 and bool(np.isfinite(np.frombuffer(blob, "<f4")).all())
+    return len(blob) > 0 and b"\0" not in np.isfinite(np.frombuffer(blob, _NUMBER)).tobytes()
 
 
 def _is_value(key: str, text: str) -> bool:

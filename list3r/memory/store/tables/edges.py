@@ -39,6 +39,9 @@ class Edges:
         """Store measured edges; one measured again replaces the old one."""
         known, fresh = self._by_key(), list(edges)
         self._rows.put(fresh)
+        if len(fresh) > len(known) // 4:
+            self._known = None
+            return
         condition = "u = ? AND v = ? AND kind = ? AND frame_u = ? AND frame_v = ?"
         known |= {_key(e): e for key in map(_key, fresh) for e in self._rows.all(condition, key)}
         self._known = dict(sorted(known.items()))
