@@ -15,7 +15,7 @@ from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
 from training.worlds.furnish import make_world
 from training.worlds.materials import Palette
-from training.worlds.settle import drop, new_bed
+from training.worlds.settle import drop, new_bed, profile
 from training.worlds.tabletop import book, mug
 
 
@@ -147,13 +147,13 @@ def test_what_is_dropped_rests_on_what_is_below() -> None:
     book(below)
     book(above)
     mug(beside)
-    first = drop(bed, below, np.eye(3), (0.0, 0.0), stacks=True)
+    first = drop(bed, profile(below, np.eye(3)), np.eye(3), (0.0, 0.0), stacks=True)
     assert first is not None and first[2, 3] == pytest.approx(0.701, abs=0.002)
     thick = below.bounds()[1][2]
-    second = drop(bed, above, np.eye(3), (0.0, 0.0), stacks=True)
+    second = drop(bed, profile(above, np.eye(3)), np.eye(3), (0.0, 0.0), stacks=True)
     assert second is not None and second[2, 3] == pytest.approx(first[2, 3] + thick, abs=0.003)
-    assert drop(bed, beside, np.eye(3), (0.02, 0.02), stacks=False) is None
-    assert drop(bed, beside, np.eye(3), (0.6, 0.0), stacks=False) is None
+    assert drop(bed, profile(beside, np.eye(3)), np.eye(3), (0.02, 0.02), stacks=False) is None
+    assert drop(bed, profile(beside, np.eye(3)), np.eye(3), (0.6, 0.0), stacks=False) is None
 
 
 def test_a_film_is_a_function_of_its_seed_and_its_truth_fits() -> None:
