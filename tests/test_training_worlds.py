@@ -10,12 +10,14 @@ import pytest
 pytest.importorskip("open3d")
 
 from list3r.memory.errors import SourceError
-from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, kinds_at
+from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, STYLED, kinds_at
 from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
 from training.worlds.furnish import make_world
 from training.worlds.materials import Palette
+from training.worlds.mesh import box
 from training.worlds.settle import drop, new_bed, profile
+from training.worlds.styles import vary
 from training.worlds.tabletop import book, mug
 
 
@@ -29,6 +31,38 @@ def test_every_kind_is_a_whole_mesh_of_a_likely_size(name: str) -> None:
     assert np.isfinite(mesh.vertices).all()
     assert 0 <= mesh.triangles.min() and mesh.triangles.max() < len(mesh.vertices)
     assert 0.005 < np.max(high - low) < 3.5
+
+
+@pytest.mark.parametrize("name", sorted(STYLED))
+def test_every_style_is_a_whole_mesh_with_room_on_it(name: str) -> None:
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        draft = Draft(rng, Palette(rng, held_out=False, more=True))
+        STYLED[name].build(draft)
+        low, high = draft.bounds()
+        assert np.isfinite(draft.mesh().vertices).all()
+        assert 0.1 < np.max(high - low) < 6.0
+        assert all(z.low[0] < z.high[0] and z.low[1] < z.high[1] for z in draft.zones)
+        assert STYLED[name].family not in HELD_OUT
+
+
+def test_what_is_varied_keeps_what_lies_on_it_where_it_was() -> None:
+    rng = np.random.default_rng(3)
+    draft = Draft(rng, Palette(rng, held_out=False))
+    draft.add(box((1.0, 0.5, 0.4)), draft.palette.paint())
+    draft.zones.append(Zone((-0.5, -0.25), (0.5, 0.25), 0.4))
+    while draft.bounds()[1][2] == 0.4:
+        vary(draft)
+    low, high = draft.bounds()
+    zone = draft.zones[0]
+    assert (*zone.low, *zone.high, zone.z) == pytest.approx((*low[:2], *high[:2], high[2]))
+
+
+def test_only_styled_rooms_have_styles_and_trim_is_wall() -> None:
+    assert not any(t.kind.endswith("in a style") for t in make_world(6).things)
+    styled = make_world(6, styled=1.0)
+    assert any(t.kind.endswith("in a style") for t in styled.things)
+    assert {t.label for t in styled.things if t.structure} <= {"floor", "ceiling", "wall"}
 
 
 @pytest.mark.parametrize("place", sorted(ODD))
@@ -178,3 +212,29 @@ def test_what_is_built_in_stands_in_the_room_and_structure_is_none_of_it() -> No
             if not thing.structure:
                 assert points[:, :2].min() > -0.05 and (points[:, :2] < np.array(world.size[:2]) + 0.05).all()
     assert make_world(2).things[6:] != worlds[0].things[6:]
+
+
+def test_a_labelled_scan_of_others_is_filmed_with_its_truth(tmp_path: Path) -> None:
+    from training.worlds.gazebo import film_house
+
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.4, 0.4, 81)]), -1).reshape(-1, 2)
+    top = np.column_stack([grid[:, 0] + 1.5, grid[:, 1], np.full(len(grid), 0.7), np.full(len(grid), 5)])
+    wall = np.stack(np.meshgrid(np.linspace(-3, 3, 301), np.linspace(0, 2.5, 126)), -1).reshape(-1, 2)
+    walls = [np.column_stack([w, wall[:, 1], 0 * wall[:, 1]]) for x in (-3.0, 3.0) for w in _sides(wall[:, 0], x)]
+    rows = np.concatenate([top, *walls])
+    head = f"# .PCD v0.7\nFIELDS x y z label\nPOINTS {len(rows)}\nDATA ascii\n"
+    file = tmp_path / "room.pcd"
+    file.write_text(head + "\n".join(" ".join(f"{v:.4f}" for v in r[:3]) + f" {int(r[3])}" for r in rows))
+    film = film_house(file, 1, "structured", frames=4)
+    kinds = {t.id: t.kind for t in film.things}
+    assert {kinds[k] for k in np.unique(film.ids).tolist() if k} >= {"floor", "unlabelled"}
+    assert {t.kind for t in film.things if not t.structure} == {"thing 5"}
+    other = tmp_path / "other.pcd"
+    other.write_text("FIELDS x y z rgb\nDATA ascii\n0 0 0 0\n")
+    with pytest.raises(SourceError, match="no point cloud with labels"):
+        film_house(other, 1, "structured", frames=4)
+
+
+def _sides(along: np.ndarray, across: float) -> list[np.ndarray]:
+    fixed = np.full(len(along), across)
+    return [np.column_stack([along, fixed]), np.column_stack([fixed, along])]
