@@ -10,14 +10,12 @@ import pytest
 pytest.importorskip("open3d")
 
 from list3r.memory.errors import SourceError
-from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, STYLED, kinds_at
+from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, kinds_at
 from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
 from training.worlds.furnish import make_world
 from training.worlds.materials import Palette
-from training.worlds.mesh import box
 from training.worlds.settle import drop, new_bed, profile
-from training.worlds.styles import vary
 from training.worlds.tabletop import book, mug
 
 
@@ -31,38 +29,6 @@ def test_every_kind_is_a_whole_mesh_of_a_likely_size(name: str) -> None:
     assert np.isfinite(mesh.vertices).all()
     assert 0 <= mesh.triangles.min() and mesh.triangles.max() < len(mesh.vertices)
     assert 0.005 < np.max(high - low) < 3.5
-
-
-@pytest.mark.parametrize("name", sorted(STYLED))
-def test_every_style_is_a_whole_mesh_with_room_on_it(name: str) -> None:
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        draft = Draft(rng, Palette(rng, held_out=False, more=True))
-        STYLED[name].build(draft)
-        low, high = draft.bounds()
-        assert np.isfinite(draft.mesh().vertices).all()
-        assert 0.1 < np.max(high - low) < 6.0
-        assert all(z.low[0] < z.high[0] and z.low[1] < z.high[1] for z in draft.zones)
-        assert STYLED[name].family not in HELD_OUT
-
-
-def test_what_is_varied_keeps_what_lies_on_it_where_it_was() -> None:
-    rng = np.random.default_rng(3)
-    draft = Draft(rng, Palette(rng, held_out=False))
-    draft.add(box((1.0, 0.5, 0.4)), draft.palette.paint())
-    draft.zones.append(Zone((-0.5, -0.25), (0.5, 0.25), 0.4))
-    while draft.bounds()[1][2] == 0.4:
-        vary(draft)
-    low, high = draft.bounds()
-    zone = draft.zones[0]
-    assert (*zone.low, *zone.high, zone.z) == pytest.approx((*low[:2], *high[:2], high[2]))
-
-
-def test_only_styled_rooms_have_styles_and_trim_is_wall() -> None:
-    assert not any(t.kind.endswith("in a style") for t in make_world(6).things)
-    styled = make_world(6, styled=1.0)
-    assert any(t.kind.endswith("in a style") for t in styled.things)
-    assert {t.label for t in styled.things if t.structure} <= {"floor", "ceiling", "wall"}
 
 
 @pytest.mark.parametrize("place", sorted(ODD))

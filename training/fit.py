@@ -17,7 +17,6 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from list3r.instances.learned.cut import EXTRA_EDGES
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
-from list3r.instances.learned.weights import load_weights
 from training.graphs import Lesson
 from training.model import PieceNetwork
 from training.worlds.catalogue import LABELS
@@ -77,9 +76,7 @@ class FitSettings:
     """What every border counts, however short it is, beside the logarithm of its length: legs are thin."""
     seed: int = 0
     start: Path | None = None
-    """Folder of an earlier fit to go on from, its learning rate a third; or a file of weights."""
-    part: str = "fine"
-    """Which network of a file of weights."""
+    """Folder of an earlier fit to go on from, its learning rate a third."""
     blind: Blindness = field(default_factory=lambda: SEEING)
 
 
@@ -93,10 +90,7 @@ def fit(
     if settings.start is None:
         _standardise(network, lessons, settings.blind)
     else:
-        if settings.start.is_file():
-            load_part(network, settings.start, settings.part)
-        else:
-            load_earlier(network, settings.start)
+        load_earlier(network, settings.start)
         rate /= 3.0
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=settings.decay)
     (folder / "labels.json").write_text(json.dumps(LABELS))
@@ -145,15 +139,6 @@ def load_earlier(network: PieceNetwork, folder: Path) -> None:
                 head[1 + k] = saved[f"node_head.{part}"][row[word]]
         saved[f"node_head.{part}"] = head
     network.load_state_dict(saved)
-
-
-def load_part(network: PieceNetwork, weights: Path, part: str) -> None:
-    """Take over one network of a file of weights, which must know the same names."""
-    arrays = load_weights(weights)
-    assert tuple(arrays["names"].tolist()) == LABELS, f"{weights.name} knows other names than the worlds have"
-    own = network.state_dict()
-    found = {k: torch.from_numpy(np.array(arrays[f"{part}.{k}"])).reshape(v.shape).to(v.dtype) for k, v in own.items()}
-    network.load_state_dict(found)
 
 
 def tensors(lesson: Lesson) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

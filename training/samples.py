@@ -73,15 +73,13 @@ def sample_of(film: Film, seed: int, every: int = 1) -> Sample:
     return Sample(seed, film.sensor, shown, ids, poses, film.things, up, reconstruction.depth_noise is not None)
 
 
-def make_sample(
-    seed: int, folder: Path, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0, styled: float = 0.0
-) -> Path:
+def make_sample(seed: int, folder: Path, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0) -> Path:
     """Make the chunk of a seed and write it, unless it is there already; return its file."""
-    kinds = (("fitted-", fitted), ("odd-", odd), ("styled-", styled))
-    name = ("test-" if held_out else "train-") + "".join(word for word, given in kinds if given)
-    path = folder / f"{name}{seed:06d}.npz"
+    path = (
+        folder / f"{'test' if held_out else 'train'}-{'fitted-' if fitted else ''}{'odd-' if odd else ''}{seed:06d}.npz"
+    )
     if not path.exists():
-        settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd, styled=styled)
+        settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd)
         settings = settings if held_out else varied(settings)
         sample = sample_of(make_film(settings), seed, settings.every)
         write_sample(path, sample)

@@ -110,12 +110,8 @@ def fit_things(
     held: Sequence[Lesson],
     settings: ThingFit | None = None,
     blind: Blindness = SEEING,
-    start: Arrays | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the classifier of things, trained on `lessons` and calibrated on left-out worlds.
-
-    With the arrays of an earlier one it goes on from there, its learning rate a third.
-    """
+    """Return the arrays of the classifier of things, trained on `lessons` and calibrated on left-out worlds."""
     s = settings or ThingFit()
     table = table_of(arrays, lessons, more=True)
     free = ~table.structure
@@ -126,12 +122,7 @@ def fit_things(
     net = nn.Sequential(
         nn.Linear(x.shape[1], s.hidden), nn.ReLU(), nn.Dropout(s.dropout), nn.Linear(s.hidden, 1 + len(LABELS))
     )
-    rate = s.rate
-    if start is not None:
-        mean, std, rate = start["things.mean"], start["things.std"], s.rate / 3
-        found = {k: torch.from_numpy(np.array(start[f"things.net.{k.replace('3.', '2.')}"])) for k in net.state_dict()}
-        net.load_state_dict(found)
-    optimiser = torch.optim.AdamW(net.parameters(), rate, weight_decay=s.decay)
+    optimiser = torch.optim.AdamW(net.parameters(), s.rate, weight_decay=s.decay)
     given, truth = torch.from_numpy((x - mean) / std), torch.from_numpy(whole.astype(np.float32))
     called = torch.from_numpy(name)
     share = torch.from_numpy(1.0 / np.sqrt(np.bincount(name[name >= 0], minlength=len(LABELS)) + 5.0)).float()
@@ -139,24 +130,24 @@ def fit_things(
     for step in range(s.steps):
         rows = torch.from_numpy(rng.integers(len(x), size=s.batch))
         for group in optimiser.param_groups:
-            group["lr"] = rate * 0.5 * (1 + float(np.cos(np.pi * step / s.steps)))
-        said = net(given[rows] + s.noise * torch.randn(len(rows), x.shape[1]))
-        loss = F.binary_cross_entropy_with_logits(said[:, 0], truth[rows])
+            group["lr"] = s.rate * 0.5 * (1 + float(np.cos(np.pi * step / s.steps)))
+        out = net(given[rows] + s.noise * torch.randn(len(rows), x.shape[1]))
+        loss = F.binary_cross_entropy_with_logits(out[:, 0], truth[rows])
         known = called[rows] >= 0
         if known.any():
             target = called[rows][known]
-            each = F.cross_entropy(said[known, 1:], target, reduction="none", label_smoothing=0.02)
+            each = F.cross_entropy(out[known, 1:], target, reduction="none", label_smoothing=0.02)
             loss = loss + (each * share[target]).sum() / share[target].sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     layers = {"0": net[0], "2": net[3]}
-    out: dict[str, NDArray[Any]] = {"things.mean": mean, "things.std": std}
+    found: dict[str, NDArray[Any]] = {"things.mean": mean, "things.std": std}
     for number, layer in layers.items():
-        out[f"things.net.{number}.weight"] = layer.weight.detach().numpy()
-        out[f"things.net.{number}.bias"] = layer.bias.detach().numpy()
-    out["names"] = np.array(LABELS)
-    return out | calibrate({**arrays, **out}, held)
+        found[f"things.net.{number}.weight"] = layer.weight.detach().numpy()
+        found[f"things.net.{number}.bias"] = layer.bias.detach().numpy()
+    found["names"] = np.array(LABELS)
+    return found | calibrate({**arrays, **found}, held)
 
 
 def calibrate(arrays: Arrays, held: Sequence[Lesson]) -> dict[str, NDArray[Any]]:

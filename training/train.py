@@ -1,7 +1,6 @@
 """Make data and weights of the learned discoverer from seeds.
 
 python -m training.train --out DIR --worlds 470 --fitted 235 --odd 400 --held 12
-python -m training.train --out DIR --worlds 0 --fitted 0 --odd 0 --styled 500 --start WEIGHTS.npz --epochs 4
 
 Every step is kept in the folder and not done again: chunks, graphs, the state of each network after each epoch.
 """
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from list3r.instances.learned.cut import EXTRA_EDGES, EXTRA_NODES, CutSettings
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
-from list3r.instances.learned.weights import load_weights, write_weights
+from list3r.instances.learned.weights import write_weights
 from training.fit import ABLATIONS, SEEING, WIDTH, Blindness, FitSettings, fit
 from training.graphs import Lesson, first_lesson, second_lessons
 from training.model import PieceNetwork
@@ -29,14 +28,12 @@ from training.samples import make_sample
 from training.things import clusters, fit_things, overlaps
 from training.worlds.catalogue import LABELS
 
-FIRST_SEED, FIRST_FITTED_SEED, FIRST_ODD_SEED, FIRST_STYLED_SEED = 1000, 2000, 3000, 4000
-"""Seeds count up from here: worlds for training, with what is built in, with what no catalogue knows, in styles."""
+FIRST_SEED, FIRST_FITTED_SEED, FIRST_ODD_SEED = 1000, 2000, 3000
+"""Seeds count up from here: worlds for training, those with what is built in, those with what no catalogue knows."""
 FIRST_HELD_SEED, FIRST_FITTED_HELD_SEED = 5000, 5500
 """Likewise left-out worlds, and those with what is built in."""
 ODD_SHARE = 0.5
 """Share of things that no catalogue knows in rooms that have such things; every third of them is fitted, too."""
-STYLED_SHARE = 0.6
-"""Share of furniture in many styles in rooms that have such; every third is fitted, every fourth odd by half."""
 
 EDGE_WIDTH = 32
 """Width of the first network's states of borders; see `WIDTH`."""
@@ -56,14 +53,9 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=470, help="rooms with loose furniture")
     parser.add_argument("--fitted", type=int, default=235, help="rooms with what is built in")
     parser.add_argument("--odd", type=int, default=400, help="rooms with things that no catalogue knows")
-    parser.add_argument("--styled", type=int, default=0, help="rooms with furniture in many styles")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=8)
-    parser.add_argument(
-        "--start",
-        type=Path,
-        help="folder of an earlier run whose first network is trained on; or a file of weights, of which both are",
-    )
+    parser.add_argument("--start", type=Path, help="folder of an earlier run whose first network is trained on")
     parser.add_argument("--without", choices=sorted(ABLATIONS), help="an ablation: what the networks do not see")
     parser.add_argument("--weights", type=Path, help="where the weights go; out/weights.npz without it")
     args = parser.parse_args()
@@ -72,16 +64,9 @@ def main() -> None:
     paths = [make_sample(FIRST_SEED + k, data) for k in range(args.worlds)]
     paths += [make_sample(FIRST_FITTED_SEED + k, data, fitted=True) for k in range(args.fitted)]
     paths += [make_sample(FIRST_ODD_SEED + k, data, fitted=k % 3 == 2, odd=ODD_SHARE) for k in range(args.odd)]
-    paths += [make_styled(k, data) for k in range(args.styled)]
     held = [make_sample(FIRST_HELD_SEED + k, data, held_out=True) for k in range(args.held)]
     held += [make_sample(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(args.held)]
     train(paths, held, args.out, args.epochs, args.weights or args.out / "weights.npz", args.start, args.without)
-
-
-def make_styled(number: int, folder: Path) -> Path:
-    """Make the chunk of a room with furniture in many styles."""
-    odd = ODD_SHARE / 2 if number % 4 == 1 else 0.0
-    return make_sample(FIRST_STYLED_SEED + number, folder, fitted=number % 3 == 2, odd=odd, styled=STYLED_SHARE)
 
 
 def train(
@@ -98,27 +83,22 @@ def train(
     blind = ABLATIONS[without] if without else SEEING
     depth = 3 if blind.messages else 0
     fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), node=WIDTH, edge=EDGE_WIDTH, depth=depth)
-    further = start if start and start.is_file() else None
-    first_start = further or (start and start / "fine")
-    settings = FitSettings(epochs, start=first_start, blind=blind, blink=0.1, average=AVERAGE, least_weight=1.0)
+    settings = FitSettings(
+        epochs, start=start and start / "fine", blind=blind, blink=0.1, average=AVERAGE, least_weight=1.0
+    )
     arrays = named("fine", fit(fine, lessons, seen, out / "fine", settings))
     every = [second_lessons(p, arrays, out / "parts", FIRST_ENDS) for p in paths]
     unseen = [second_lessons(p, arrays, out / "parts", FIRST_ENDS[:1])[0] for p in held]
-    settings = replace(settings, epochs=max(1, epochs // 2), noise=0.15, decay=1e-2, blink=0.15, part="coarse")
-    settings = replace(settings, start=further)
-    if further:
-        arrays |= {k: v for k, v in load_weights(further).items() if k.startswith("coarse.")}
-    else:
-        first = [lesson for rows in every for lesson in rows]
-        arrays |= named("coarse", fit(_second(blind), first, unseen, out / "coarse", settings))
+    settings = replace(settings, epochs=max(1, epochs // 2), start=None, noise=0.15, decay=1e-2, blink=0.15)
+    first = [lesson for rows in every for lesson in rows]
+    arrays |= named("coarse", fit(_second(blind), first, unseen, out / "coarse", settings))
     for k, p in enumerate(paths):
         every[k] += second_lessons(p, arrays, out / "parts", STATES)
     unseen = [second_lessons(p, arrays, out / "parts", STATES)[-1] for p in held]
     settings = replace(settings, epochs=max(1, epochs - 2))
     network = fit(_second(blind), [lesson for rows in every for lesson in rows], unseen, out / "states", settings)
     arrays |= named("coarse", network)
-    known = load_weights(further) if further else None
-    arrays |= fit_things(arrays, [rows[k] for rows in every for k in (0, -2, -1)], unseen, blind=blind, start=known)
+    arrays |= fit_things(arrays, [rows[k] for rows in every for k in (0, -2, -1)], unseen, blind=blind)
     write_weights(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, unseen)}))  # noqa: T201
 

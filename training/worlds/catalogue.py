@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from training.worlds import fitted as b
 from training.worlds import fixtures as f
 from training.worlds import seating as s
-from training.worlds import soft, storage, styles, tables
+from training.worlds import soft, storage, tables
 from training.worlds import tabletop as t
 from training.worlds.draft import Draft
 from training.worlds.oddments import oddment
@@ -184,34 +184,6 @@ ODD = {
 """What no catalogue knows, by place; it has no name."""
 
 KINDS = {row[0]: Kind(*row) for row in _ROWS}
-STYLED = {
-    base: Kind(f"{base} in a style", KINDS[base].family, KINDS[base].label, build, KINDS[base].place)
-    for bases, build in (
-        (("sofa", "corner sofa"), styles.sofa),
-        (("slatted chair", "padded chair", "shell chair", "office chair"), styles.chair),
-        (("bench",), styles.bench_seats),
-        (("dining table", "round table", "bar table"), styles.table((0.7, 2.6), (0.6, 1.3), (0.66, 0.82))),
-        (("coffee table",), styles.table((0.4, 1.5), (0.35, 0.95), (0.22, 0.52))),
-        (("desk",), styles.desk),
-        (("nightstand",), styles.case((0.32, 0.6), (0.3, 0.48), (0.35, 0.7))),
-        (("chest", "cupboard"), styles.case((0.45, 2.0), (0.3, 0.6), (0.55, 1.45))),
-        (("media bench",), styles.case((0.9, 2.2), (0.3, 0.55), (0.28, 0.65))),
-        (("wardrobe", "built-in wardrobe"), styles.case((0.7, 3.0), (0.35, 0.7), (1.6, 2.35))),
-        (("shelf", "frame shelf"), styles.shelf((0.4, 1.6), (0.2, 0.45), (0.6, 2.3))),
-        (("shelf wall",), styles.shelf((1.6, 4.6), (0.22, 0.5), (1.7, 2.35))),
-        (("kitchen counter", "kitchen run"), styles.kitchen),
-        (("bed",), styles.bed),
-        (("floor lamp",), styles.lamp),
-        (("hanging lamp",), styles.hanging_lamp),
-        (("plant",), styles.plant),
-        (("television", "monitor"), styles.screen_on_stand),
-        (("basket",), styles.bin_),
-        (("door",), styles.door),
-        (("window", "large window"), styles.window),
-    )
-    for base in bases
-}
-"""What stands in for a kind in rooms that are furnished in many styles."""
 LOOSE = {
     "cushion": "cushion",
     "pillow": "cushion",

@@ -63,8 +63,6 @@ class FilmSettings:
     """Rooms with what is built in, see `make_world`."""
     odd: float = 0.0
     """Share of things that no catalogue knows, see `make_world`."""
-    styled: float = 0.0
-    """Share of furniture in many styles, see `make_world`."""
     frames: int = 30
     every: int = 2
     """Only every n-th frame of the walk is filmed, which is all that fusion looks at."""
@@ -101,7 +99,7 @@ class Visit:
 def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
     """Return the walk of a seed through the world of that seed."""
     visit = visit or Visit()
-    world = _world(settings)
+    world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted, odd=settings.odd)
     rng = np.random.default_rng([settings.seed, 7])
     sensors = SENSORS if settings.held_out else tuple(s for s in SENSORS if s not in HELD_OUT_SENSORS)
     sensor = settings.sensor or str(rng.choice(sensors))
@@ -139,14 +137,10 @@ def _shifted(thing: Placed, visit: Visit) -> Placed | None:
 
 def world_extents(settings: FilmSettings) -> dict[int, NDArray[np.float64]]:
     """Return lower and upper corners of the things of a world that are no structure. Shapes (2, 3)."""
-    world = _world(settings)
+    world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted, odd=settings.odd)
     return {
         t.id: np.stack([t.vertices().min(axis=0), t.vertices().max(axis=0)]) for t in world.things if not t.structure
     }
-
-
-def _world(s: FilmSettings) -> World:
-    return make_world(s.seed, held_out=s.held_out, fitted=s.fitted, odd=s.odd, styled=s.styled)
 
 
 def _truth(thing: Placed) -> Truth:

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from training.worlds.catalogue import KINDS, ODD, STYLED, Kind, kinds_at
+from training.worlds.catalogue import KINDS, ODD, Kind, kinds_at
 from training.worlds.draft import Draft
 from training.worlds.fitted import built_in_wardrobe, folding_door, large_window, shelf_wall, sliding_door
 from training.worlds.materials import Palette
 from training.worlds.mesh import box
 from training.worlds.room import Placed, Room, flat_pose, room_shell
 from training.worlds.settle import fill_zone
-from training.worlds.structural import Niche, build_structure, trim_walls
-from training.worlds.styles import vary
+from training.worlds.structural import Niche, build_structure
 
 
 @dataclass(frozen=True)
@@ -27,30 +26,22 @@ class World:
     room: Room
 
 
-def make_world(
-    seed: int, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0, styled: float = 0.0
-) -> World:
+def make_world(seed: int, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0) -> World:
     """Return the furnished room of a seed; with `held_out` families and textures appear that training never shows.
 
     `fitted` rooms have structure that looks like things, and things that are built in. `odd` is the share of oddments;
-    rooms with them may be larger, and things stand on their tops in rows, too. `styled` is the share of furniture in
-    many styles; such rooms are larger still, their walls have skirtings, and their surfaces more patterns.
+    rooms with them may be larger, and things stand on their tops in rows, too.
     """
     rng = np.random.default_rng([seed, 1 if held_out else 0])
-    most = 8.5 if styled else 7.5 if odd else 6.5 if fitted else 5.5
-    high = 3.3 if styled else 2.9
-    size = (float(rng.uniform(2.8, most)), float(rng.uniform(2.8, most)), float(rng.uniform(2.35, high)))
-    palette = Palette(rng, held_out=held_out, more=styled > 0)
+    most = 7.5 if odd else 6.5 if fitted else 5.5
+    size = (float(rng.uniform(2.8, most)), float(rng.uniform(2.8, most)), float(rng.uniform(2.35, 2.9)))
+    palette = Palette(rng, held_out=held_out)
     room = Room(size, rng)
-    painter = _Furnisher(room, palette, held_out, odd, styled)
+    painter = _Furnisher(room, palette, held_out, odd)
     painter.shell()
-    if styled:
-        trim_walls(room, palette)
     if fitted:
         painter.built_in()
     painter.openings()
-    if styled:
-        painter.rows()
     painter.groups()
     painter.along_walls()
     painter.loose_furniture()
@@ -63,8 +54,8 @@ def make_world(
 class _Furnisher:
     """Fills one room, step by step."""
 
-    def __init__(self, room: Room, palette: Palette, held_out: bool, odd: float, styled: float) -> None:
-        self.odd, self.styled = odd, styled
+    def __init__(self, room: Room, palette: Palette, held_out: bool, odd: float) -> None:
+        self.odd = odd
         self.room, self.palette, self.held_out, self.rng = room, palette, held_out, room.rng
         self.zones: list[tuple[Draft, NDArray[np.float64], Kind]] = []
         self.messy = float(room.rng.choice([0.3, 1.0, 2.0]))
@@ -72,21 +63,14 @@ class _Furnisher:
     def _draft(self, kind: Kind) -> Draft:
         draft = Draft(self.rng, self.palette)
         kind.build(draft)
-        if self.styled:
-            vary(draft)
         return draft
-
-    def _kind(self, name: str) -> Kind:
-        """Return a kind of the catalogue, or what stands in for it."""
-        styled = self.styled and name in STYLED and self.rng.random() < self.styled
-        return STYLED[name] if styled else KINDS[name]
 
     def _draw(self, place: str) -> Kind:
         if self.odd and place in ODD and self.rng.random() < self.odd:
             return ODD[place]
         kinds = kinds_at(place, held_out=self.held_out)
         weight = np.array([k.weight for k in kinds])
-        return self._kind(kinds[int(self.rng.choice(len(kinds), p=weight / weight.sum()))].name)
+        return kinds[int(self.rng.choice(len(kinds), p=weight / weight.sum()))]
 
     def _place(self, kind: Kind, draft: Draft, pose: NDArray[np.float64], *, mark: bool = True) -> None:
         self.room.place(kind.name, kind.label, kind.family, draft, pose, mark=mark)
@@ -190,9 +174,9 @@ class _Furnisher:
 
     def openings(self) -> None:
         """Make doors and windows, with radiators below and curtains beside them."""
-        self._hang(self._kind("door"), 0.0)
+        self._hang(KINDS["door"], 0.0)
         for _ in range(int(self.rng.integers(0, 3))):
-            found = self._hang(self._kind("window"), self.rng.uniform(0.8, 1.0))
+            found = self._hang(KINDS["window"], self.rng.uniform(0.8, 1.0))
             if found is None:
                 continue
             wall, x, window = found
@@ -241,14 +225,14 @@ class _Furnisher:
             ]()
 
     def _sofa_group(self) -> None:
-        found = self._against(self._kind("sofa"))
+        found = self._against(KINDS["sofa"])
         if found is None:
             return
         pose, depth = found[3], found[2].bounds()[1][1]
         if self.rng.random() < 0.6:
             self._lay_rug(pose @ flat_pose(0.0, depth + 0.4, 0.0))
         if self.rng.random() < 0.75:
-            kind = self._kind("coffee table")
+            kind = KINDS["coffee table"]
             draft = self._draft(kind)
             spot = pose @ flat_pose(
                 self.rng.uniform(-0.2, 0.2),
@@ -272,7 +256,7 @@ class _Furnisher:
             self._place(KINDS["rug"], draft, pose, mark=False)
 
     def _desk_group(self) -> None:
-        found = self._against(self._kind("desk"))
+        found = self._against(KINDS["desk"])
         if found is None:
             return
         _, _, table, pose = found
@@ -289,8 +273,8 @@ class _Furnisher:
             if self._allowed(name) or name in ("monitor", "keyboard"):
                 used.append(
                     (
-                        kind := self._kind(name),
-                        self._draft(kind),
+                        KINDS[name],
+                        self._draft(KINDS[name]),
                         pose @ flat_pose(x, y, self.rng.normal(0, 0.06), top.z + 0.001),
                     )
                 )
@@ -304,7 +288,7 @@ class _Furnisher:
                 self.zones.append((side, pose, KINDS["desk"]))
         name = "office chair" if self.rng.random() < 0.6 else "padded chair"
         self._chair_at(
-            self._kind(name),
+            name,
             pose
             @ flat_pose(
                 self.rng.uniform(-0.2, 0.2),
@@ -313,26 +297,26 @@ class _Furnisher:
             ),
         )
 
-    def _chair_at(self, kind: Kind, pose: NDArray[np.float64], state: dict[str, object] | None = None) -> None:
+    def _chair_at(self, name: str, pose: NDArray[np.float64], state: dict[str, object] | None = None) -> None:
         before = self.rng.bit_generator.state
         if state is not None:
             self.rng.bit_generator.state = state
-        draft = self._draft(kind)
+        draft = self._draft(KINDS[name])
         if state is not None:
             self.rng.bit_generator.state = before
         if self.room.fits(draft, pose):
-            self._place(kind, draft, pose)
+            self._place(KINDS[name], draft, pose)
 
     def _bed_group(self) -> None:
-        found = self._against(self._kind("bed"), 12)
+        found = self._against(KINDS["bed"], 12)
         if found is None or self.rng.random() < 0.3:
             return
         wall, x, draft, _ = found
         for side in (-1, 1):
-            self._against(self._kind("nightstand"), 3, wall, x + side * (draft.bounds()[1][0] + 0.32))
+            self._against(KINDS["nightstand"], 3, wall, x + side * (draft.bounds()[1][0] + 0.32))
 
     def _table_group(self) -> None:
-        kind = self._kind("dining table" if self.rng.random() < 0.7 else "round table")
+        kind = KINDS["dining table"] if self.rng.random() < 0.7 else KINDS["round table"]
         for _ in range(8):
             draft = self._draft(kind)
             w, deep, _ = self.room.size
@@ -346,7 +330,7 @@ class _Furnisher:
         else:
             return
         self._place(kind, draft, pose)
-        chair = self._kind(str(self.rng.choice(["slatted chair", "padded chair", "shell chair"])))
+        name = str(self.rng.choice(["slatted chair", "padded chair", "shell chair"]))
         state = self.rng.bit_generator.state
         half_x, half_y = draft.bounds()[1][:2]
         spots = [
@@ -359,28 +343,7 @@ class _Furnisher:
             if self.rng.random() < 0.65:
                 out = self.rng.uniform(-0.22, 0.3)
                 away = np.array([x, y]) + out * np.array([np.sin(yaw), -np.cos(yaw)]) * 1.0
-                self._chair_at(chair, pose @ flat_pose(away[0], away[1], yaw + self.rng.normal(0, 0.2)), state)
-
-    def rows(self) -> None:
-        """Stand equal furniture side by side or back to back, as offices, shops and libraries have it, at times."""
-        if self.rng.random() > 0.3 or min(self.room.size[:2]) < 3.6:
-            return
-        kind = self._kind(str(self.rng.choice(["desk", "desk", "shelf", "bench", "cupboard"])))
-        state, chair = self.rng.bit_generator.state, self._kind("office chair")
-        low, high = self._draft(kind).bounds()
-        w, deep, _ = self.room.size
-        yaw, facing = float(self.rng.integers(2)) * np.pi / 2, self.rng.random() < 0.5
-        pose = flat_pose(self.rng.uniform(1.0, w - 1.0), self.rng.uniform(1.0, deep - 1.0), yaw)
-        gap, seated = float(self.rng.choice([0.004, 0.02, 0.6])), self.rng.bit_generator.state
-        for k in range(int(self.rng.integers(2, 5))):
-            for side in (1, -1) if facing else (1,):
-                spot = pose @ flat_pose(
-                    (high[0] - low[0] + gap) * k, -side * (low[1] - 0.004), 0.0 if side > 0 else np.pi
-                )
-                self._chair_at(kind, spot, state)
-                if kind.label == "desk":
-                    at = flat_pose(self.rng.uniform(-0.2, 0.2), high[1] + self.rng.uniform(0.0, 0.4), np.pi)
-                    self._chair_at(chair, spot @ at, seated)
+                self._chair_at(name, pose @ flat_pose(away[0], away[1], yaw + self.rng.normal(0, 0.2)), state)
 
     def along_walls(self) -> None:
         """Stand furniture along the walls."""

@@ -12,9 +12,7 @@ Floats = NDArray[np.float32]
 _LATTICE, _FINE = 16, 8
 """Cells of the noise along each axis, and samples in each."""
 
-MORE_PATTERNS = ("planks", "tiles", "marble", "patches", "shade")
-"""Only in rooms that are furnished in many styles."""
-PATTERNS = ("plain", "noise", "wood", "stripes", "checks", "dots", "print", "bricks", "speckle", *MORE_PATTERNS)
+PATTERNS = ("plain", "noise", "wood", "stripes", "checks", "dots", "print", "bricks", "speckle")
 HELD_OUT_PATTERNS = ("checks", "print")
 """Not used in worlds for training, so that tests see textures of another kind."""
 
@@ -73,7 +71,7 @@ class MaterialTable:
     def _share(self, pattern: str, uv: Floats, xyz: Floats) -> Floats:
         """How much of the second colour is in each point. Shape (N,)."""
         u, v = uv.T % 1.0
-        if pattern in ("noise", "speckle", "wood", "print", *MORE_PATTERNS):
+        if pattern in ("noise", "speckle", "wood", "print"):
             return np.asarray(self._grown(pattern, uv, xyz), np.float32)
         drawn = {
             "plain": lambda: np.full(len(uv), 0.1),
@@ -93,17 +91,6 @@ class MaterialTable:
         if pattern == "wood":
             rings = uv[:, 0] * 3 + 1.5 * self._noise(np.column_stack([uv[:, 0], uv[:, 1] * 0.15, xyz[:, 0] * 0.1]))
             return np.abs(rings % 1.0 - 0.5)
-        if pattern in ("planks", "tiles"):
-            cell = np.floor(uv * ([0.25, 1.0] if pattern == "planks" else [0.5, 0.5]))
-            joint = (uv[:, 1] % 1.0 < 0.04) if pattern == "planks" else ((uv * 0.5 % 1.0) < 0.04).any(axis=1)
-            tint = np.sin(cell[:, 0] * 127.1 + cell[:, 1] * 311.7) * 43758.5453 % 1.0
-            return np.clip(0.7 * tint + 0.3 * self._noise(xyz * 3) + joint, 0, 1)
-        if pattern == "marble":
-            return np.abs(np.sin(3 * (uv[:, 0] + 2 * self._noise(xyz * np.float32(0.7)) + self._noise(xyz * 2))))
-        if pattern == "patches":
-            return np.clip(1.6 * self._noise(xyz * np.float32(0.5)) + 0.6 * self._noise(xyz * 2) - 0.6, 0, 1)
-        if pattern == "shade":
-            return self._noise(xyz * np.float32(0.2))
         flat = np.column_stack([uv, uv[:, 0]]) * np.float32(1.3)
         return np.floor(3 * self._noise(flat) + 2 * self._noise(xyz * np.float32(0.6))) % 2
 
@@ -134,15 +121,13 @@ def _hsv(h: float, s: float, v: float) -> tuple[float, float, float]:
 
 
 class Palette:
-    """Draws materials; the patterns of a world for training are not those of all worlds. `more` draws from more."""
+    """Draws materials; the patterns of a world for training are not those of all worlds."""
 
-    def __init__(self, rng: np.random.Generator, *, held_out: bool, more: bool = False) -> None:
-        self._rng, self._held_out, self._more = rng, held_out, more
+    def __init__(self, rng: np.random.Generator, *, held_out: bool) -> None:
+        self._rng, self._held_out = rng, held_out
         self._woods = [self._wood() for _ in range(3)]
 
     def _allowed(self, patterns: tuple[str, ...]) -> str:
-        if self._more and self._rng.random() < 0.35:
-            return str(self._rng.choice(MORE_PATTERNS))
         usual = [p for p in patterns if p not in HELD_OUT_PATTERNS]
         known = list(patterns) if self._held_out else usual or ["noise"]
         return str(self._rng.choice(known))

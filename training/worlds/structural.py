@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,25 +116,3 @@ def _half_wall(room: Room, wall: Material) -> None:
         mesh = box((thick, out, tall))
         if _stand(room, mesh, wall, room.wall_pose(number, x, out / 2 + 0.003)):
             room.wall_free(number, (x - thick / 2, x + thick / 2), (0, h), take=True)
-
-
-def trim_walls(room: Room, palette: Palette) -> None:
-    """Give the walls skirtings, panelling or a strip below the ceiling, at times; all of it is wall."""
-    rng, h = room.rng, room.size[2]
-    trim = palette.paint() if rng.random() < 0.6 else palette.wood()
-    bands = []
-    if rng.random() < 0.7:
-        bands.append((0.0, float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.008, 0.025))))
-    if rng.random() < 0.15:
-        bands.append((0.0, float(rng.uniform(0.7, 1.3)), float(rng.uniform(0.005, 0.02))))
-    if rng.random() < 0.25:
-        tall = float(rng.uniform(0.05, 0.2))
-        bands.append((h - tall - 0.002, tall, float(rng.uniform(0.01, 0.1))))
-    walls = [k for k, t in enumerate(room.things) if t.label == "wall"][:4]
-    for z, tall, thick in bands:
-        for number, row in enumerate(walls):
-            length, wall = room.wall_length(number), room.things[row]
-            pose = room.wall_pose(number, length / 2, thick / 2 + 0.0005, z + 0.001)
-            mesh = box((length - 0.002, thick, tall))
-            mesh = Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.triangles)
-            room.things[row] = replace(wall, parts=(*wall.parts, (mesh, trim)))
