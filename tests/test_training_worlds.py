@@ -15,7 +15,7 @@ from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film
 from training.worlds.furnish import make_world
 from training.worlds.materials import Palette
-from training.worlds.settle import drop, new_bed
+from training.worlds.settle import drop, new_bed, profile
 from training.worlds.tabletop import book, mug
 
 
@@ -147,13 +147,13 @@ def test_what_is_dropped_rests_on_what_is_below() -> None:
     book(below)
     book(above)
     mug(beside)
-    first = drop(bed, below, np.eye(3), (0.0, 0.0), stacks=True)
+    first = drop(bed, profile(below, np.eye(3)), np.eye(3), (0.0, 0.0), stacks=True)
     assert first is not None and first[2, 3] == pytest.approx(0.701, abs=0.002)
     thick = below.bounds()[1][2]
-    second = drop(bed, above, np.eye(3), (0.0, 0.0), stacks=True)
+    second = drop(bed, profile(above, np.eye(3)), np.eye(3), (0.0, 0.0), stacks=True)
     assert second is not None and second[2, 3] == pytest.approx(first[2, 3] + thick, abs=0.003)
-    assert drop(bed, beside, np.eye(3), (0.02, 0.02), stacks=False) is None
-    assert drop(bed, beside, np.eye(3), (0.6, 0.0), stacks=False) is None
+    assert drop(bed, profile(beside, np.eye(3)), np.eye(3), (0.02, 0.02), stacks=False) is None
+    assert drop(bed, profile(beside, np.eye(3)), np.eye(3), (0.6, 0.0), stacks=False) is None
 
 
 def test_a_film_is_a_function_of_its_seed_and_its_truth_fits() -> None:
@@ -178,3 +178,29 @@ def test_what_is_built_in_stands_in_the_room_and_structure_is_none_of_it() -> No
             if not thing.structure:
                 assert points[:, :2].min() > -0.05 and (points[:, :2] < np.array(world.size[:2]) + 0.05).all()
     assert make_world(2).things[6:] != worlds[0].things[6:]
+
+
+def test_a_labelled_scan_of_others_is_filmed_with_its_truth(tmp_path: Path) -> None:
+    from training.worlds.gazebo import film_house
+
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.4, 0.4, 81)]), -1).reshape(-1, 2)
+    top = np.column_stack([grid[:, 0] + 1.5, grid[:, 1], np.full(len(grid), 0.7), np.full(len(grid), 5)])
+    wall = np.stack(np.meshgrid(np.linspace(-3, 3, 301), np.linspace(0, 2.5, 126)), -1).reshape(-1, 2)
+    walls = [np.column_stack([w, wall[:, 1], 0 * wall[:, 1]]) for x in (-3.0, 3.0) for w in _sides(wall[:, 0], x)]
+    rows = np.concatenate([top, *walls])
+    head = f"# .PCD v0.7\nFIELDS x y z label\nPOINTS {len(rows)}\nDATA ascii\n"
+    file = tmp_path / "room.pcd"
+    file.write_text(head + "\n".join(" ".join(f"{v:.4f}" for v in r[:3]) + f" {int(r[3])}" for r in rows))
+    film = film_house(file, 1, "structured", frames=4)
+    kinds = {t.id: t.kind for t in film.things}
+    assert {kinds[k] for k in np.unique(film.ids).tolist() if k} >= {"floor", "unlabelled"}
+    assert {t.kind for t in film.things if not t.structure} == {"thing 5"}
+    other = tmp_path / "other.pcd"
+    other.write_text("FIELDS x y z rgb\nDATA ascii\n0 0 0 0\n")
+    with pytest.raises(SourceError, match="no point cloud with labels"):
+        film_house(other, 1, "structured", frames=4)
+
+
+def _sides(along: np.ndarray, across: float) -> list[np.ndarray]:
+    fixed = np.full(len(along), across)
+    return [np.column_stack([along, fixed]), np.column_stack([fixed, along])]

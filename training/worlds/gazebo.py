@@ -27,6 +27,7 @@ from training.worlds.collada import TexturedMesh, read_collada
 from training.worlds.film import Film, Truth, Visit
 from training.worlds.mesh import turn
 from training.worlds.render import Caster, Hits, Light, Renderer
+from training.worlds.scans import read_scan
 from training.worlds.sensors import drift_field, read
 
 STRUCTURE = ("Wall", "Ceiling", "Floor", "Column", "ground_plane", "office_small", "office_env", "floor_")
@@ -41,13 +42,16 @@ class _House:
     """Meshes in the world, whose they are, and what they are called."""
 
     def __init__(self, place: Path) -> None:
+        self.meshes: list[TexturedMesh] = []
+        self.owner: list[int] = []
+        self.things: list[Truth] = []
+        if place.suffix == ".pcd":
+            self.meshes, self.owner, self.things = read_scan(place)
+            return
         file = place if place.is_file() else min((place / "worlds").glob("*.world"))
         world = ET.parse(file).getroot().find("world")
         assert world is not None, f"{file.name} holds no world"
         self._models = file.parent.parent / "models"
-        self.meshes: list[TexturedMesh] = []
-        self.owner: list[int] = []
-        self.things: list[Truth] = []
         for model in world.iterfind("model"):
             self._add(model, _state(world.find("state"), model.get("name", "")))
 
@@ -224,7 +228,8 @@ def film_house(
 ) -> Film:
     """Return a walk of a seed through the house, of which every n-th frame is filmed.
 
-    `folder` may be a file of the world, too; then people also walk where nothing is above them, for lack of ceilings.
+    `folder` may be a file of the world, or a labelled scan (`scans`), too; then people also walk where nothing is above
+    them, for lack of ceilings.
     """
     house, caster = _loaded(folder)
     visit = visit or Visit()

@@ -29,9 +29,10 @@ class Bed:
     """Above the zone's surface, metres (rows along y)."""
 
 
-def profile(
-    draft: Draft, rotation: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+Profile = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
+def profile(draft: Draft, rotation: NDArray[np.float64]) -> Profile:
     """Return lower and upper heights of a turned thing over a grid, NaN where it is not, and the grid's low corner."""
     points = draft.mesh()
     vertices = points.vertices @ rotation.T
@@ -53,13 +54,15 @@ def profile(
 
 
 def drop(
-    bed: Bed, draft: Draft, rotation: NDArray[np.float64], at: tuple[float, float], *, stacks: bool
+    bed: Bed, shape: Profile, rotation: NDArray[np.float64], at: tuple[float, float], *, stacks: bool
 ) -> NDArray[np.float64] | None:
     """Return the pose in the thing of the zone at which a thing comes to rest with its low corner `at`, or None.
 
+    `shape` is its profile, turned by `rotation`.
+
     It may rest on others only where `stacks`, with its middle over what carries it.
     """
-    bottom, top, low = profile(draft, rotation)
+    bottom, top, low = shape
     rows, columns = bottom.shape
     r0, c0 = int((at[1] - bed.zone.low[1]) / CELL_M), int((at[0] - bed.zone.low[0]) / CELL_M)
     if r0 < 0 or c0 < 0 or r0 + rows > bed.height.shape[0] or c0 + columns > bed.height.shape[1]:
@@ -148,10 +151,10 @@ def _put(room: Room, bed: Bed, kind: Kind, draft: Draft, pose: NDArray[np.float6
     room_x, room_y = zone.high[0] - zone.low[0] - (high - low)[0], zone.high[1] - zone.low[1] - (high - low)[1]
     if room_x < 0.02 or room_y < 0.02:
         return
-    stacks = kind.family in STACKS and rng.random() < 0.6
+    stacks, shape = kind.family in STACKS and rng.random() < 0.6, profile(draft, rotation)
     for _ in range(7):
         at = (zone.low[0] + rng.uniform(0, room_x - 0.015), zone.low[1] + rng.uniform(0, room_y - 0.015))
-        local = drop(bed, draft, rotation, at, stacks=stacks)
+        local = drop(bed, shape, rotation, at, stacks=stacks)
         if local is not None:
             room.place(kind.name, kind.label, kind.family, draft, pose @ local, mark=False)
             return
@@ -163,13 +166,13 @@ def _twins(room: Room, palette: Palette, bed: Bed, pose: NDArray[np.float64], ki
     draft = Draft(rng, palette)
     kind.build(draft)
     rotation = turn(float(rng.integers(4)) * np.pi / 2 + rng.normal(0, 0.05))
-    vertices = draft.mesh().vertices @ rotation.T
+    vertices, shape = draft.mesh().vertices @ rotation.T, profile(draft, rotation)
     step = (vertices.max(axis=0) - vertices.min(axis=0))[:2] + rng.uniform(0.005, 0.06)
     start = np.array(zone.low) + rng.uniform(0, 0.5, 2) * (np.array(zone.high) - np.array(zone.low))
     for i in range(int(rng.integers(2, 6))):
         for j in range(int(rng.integers(1, 4))):
             x, y = start + step * (i, j) + rng.normal(0, 0.004, 2)
-            local = drop(bed, draft, rotation, (float(x), float(y)), stacks=False)
+            local = drop(bed, shape, rotation, (float(x), float(y)), stacks=False)
             if local is not None:
                 room.place(kind.name, kind.label, kind.family, draft, pose @ local, mark=False)
 
@@ -190,7 +193,7 @@ def _book_row(room: Room, palette: Palette, bed: Bed, pose: NDArray[np.float64])
         vertices = draft.mesh().vertices @ rotation.T
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         y = min(zone.high[1] - rng.uniform(0.0, 0.05), zone.high[1]) - (high - low)[1] - 0.012
-        local = drop(bed, draft, rotation, (x, y), stacks=False)
+        local = drop(bed, profile(draft, rotation), rotation, (x, y), stacks=False)
         if local is None:
             return
         room.place("book", "book", "book", draft, pose @ local, mark=False)
