@@ -44,7 +44,7 @@ def test_a_bent_patch_without_a_border_is_wall(bend_m: float, tone: float, thing
     planes = [p for p in find_planes(surface.cloud, 0.2, 1.0) if len(p.members) > 2000]
     doubt = np.full(len(cut.labels), 0.05, np.float32)
     left = without_bends(surface, cut, planes, doubt, DepthErrorSettings())
-    assert len(left.told.structure) == things and (left.labels >= 0).all()
+    assert len(left.verdicts.structure) == things and (left.labels >= 0).all()
 
 
 def test_the_step_across_a_rim_is_that_of_the_pictures() -> None:
@@ -58,4 +58,4 @@ def test_what_is_narrower_than_its_doubt_is_seldom_whole(doubt_m: float, whole: 
     surface, cut = wall(0.06, 12.0)
     doubt = np.full(len(cut.labels), doubt_m, np.float32)
     found = without_slivers(surface.cloud, cut, doubt, DepthErrorSettings(), 0.3)
-    assert found.told.whole[1] == pytest.approx(whole) and found.told.whole[0] == pytest.approx(0.1)
+    assert found.verdicts.whole[1] == pytest.approx(whole) and found.verdicts.whole[0] == pytest.approx(0.1)

@@ -217,7 +217,7 @@ def test_walls_round_a_corner_are_two() -> None:
     one = np.ones(1, np.float32)
     cut = CloudCut(np.zeros(count, np.int32), ThingVerdicts(one, one, one[:, None]))
     parted = _walls_apart(cloud, cut, find_planes(cloud, 0.03, 1.0))
-    assert len(parted.told.structure) == len(parted.told.whole) == 2
+    assert len(parted.verdicts.structure) == len(parted.verdicts.whole) == 2
     first = cloud.points[:, 1] < cloud.points[:, 0]
     far = np.abs(cloud.points[:, 0] - cloud.points[:, 1]) > 0.05
     assert len(np.unique(parted.labels[first & far])) == len(np.unique(parted.labels[~first & far])) == 1
@@ -231,7 +231,7 @@ def test_both_sides_of_a_thin_wall_are_one() -> None:
     cut = CloudCut(np.zeros(len(cloud.keys), np.int32), ThingVerdicts(one, one, one[:, None]))
     (plane,) = find_planes(cloud, 0.03, 1.0)
     parted = _walls_apart(cloud, cut, [plane, replace(plane, equation=-plane.equation)])
-    assert len(parted.told.structure) == 1 and set(parted.labels.tolist()) == {0}
+    assert len(parted.verdicts.structure) == 1 and set(parted.labels.tolist()) == {0}
 
 
 def cloud_of(points: np.ndarray, normals: np.ndarray) -> Cloud:

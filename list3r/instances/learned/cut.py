@@ -37,12 +37,12 @@ class CloudCut:
 
     labels: NDArray[np.int32]
     """Thing of each voxel, from 0; -1 for none. Shape (N,)."""
-    told: ThingVerdicts
+    verdicts: ThingVerdicts
 
     def only(self, kept: NDArray[np.bool_]) -> CloudCut:
         """Return the cut with only the things that are `kept` (T,); the voxels of the others are of none."""
         number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
-        return CloudCut(np.asarray(number[self.labels], np.int32), self.told.rows(np.flatnonzero(kept)))
+        return CloudCut(np.asarray(number[self.labels], np.int32), self.verdicts.rows(np.flatnonzero(kept)))
 
 
 def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | None = None) -> CloudCut:

@@ -58,7 +58,7 @@ def without_bends(
     """Return the cut with what is a patch of a wall or floor joined to it: what lies in the plane of a structure within
     the doubt of depth (N,), and what no border in the pictures parts from what is round it.
     """
-    structure = cut.told.structure > 0.5
+    structure = cut.verdicts.structure > 0.5
     held = np.append(structure, False)[cut.labels]
     bounding = [p for p in planes if held[p.members].mean() > 0.5]
     steps = rim_steps(surface, cut, s.reach_px)
@@ -75,15 +75,15 @@ def without_bends(
     into[-1] = -1
     labels = np.asarray(into[cut.labels], np.int32)
     left = np.bincount(labels[labels >= 0], minlength=len(structure)) > 0
-    return CloudCut(labels, cut.told).only(left)
+    return CloudCut(labels, cut.verdicts).only(left)
 
 
 def rim_steps(surface: ChunkSurface, cut: CloudCut, reach_px: int) -> NDArray[np.float64]:
     """Return the median step of colour across the rim of each thing, where beyond it is structure or nothing known.
     Infinite where nothing is. Shape (T,).
     """
-    count = len(cut.told.structure)
-    structure, owner = np.append(cut.told.structure > 0.5, True), [np.zeros(0, np.int64)]
+    count = len(cut.verdicts.structure)
+    structure, owner = np.append(cut.verdicts.structure > 0.5, True), [np.zeros(0, np.int64)]
     step = [np.zeros(0, np.float32)]
     for index, lab in zip(surface.cloud.index, surface.view_lab, strict=True):
         image = np.append(cut.labels, -1)[index]
@@ -109,10 +109,10 @@ def without_slivers(
     """Return the cut in which what is narrower than the doubt of its depth (N,) is one whole with at most the
     probability `most`.
     """
-    whole = cut.told.whole.copy()
-    for number in np.flatnonzero((cut.told.structure <= 0.5) & (whole > most)).tolist():
+    whole = cut.verdicts.whole.copy()
+    for number in np.flatnonzero((cut.verdicts.structure <= 0.5) & (whole > most)).tolist():
         mine = np.flatnonzero(cut.labels == number)
         second = float(np.linalg.eigvalsh(np.cov(cloud.points[mine].T))[1]) if len(mine) > 2 else 0.0
         if second < (s.least_spread * float(np.median(doubt[mine]))) ** 2:
             whole[number] = most
-    return replace(cut, told=replace(cut.told, whole=whole))
+    return replace(cut, verdicts=replace(cut.verdicts, whole=whole))

@@ -49,7 +49,7 @@ class LearnedSettings:
     plane_area_m2: float = 0.25
     """Smallest flat surface looked for, from which gravity is told and structure is parted."""
     cut: CutSettings = field(default_factory=CutSettings)
-    doubt: DepthErrorSettings = field(default_factory=DepthErrorSettings)
+    depth_errors: DepthErrorSettings = field(default_factory=DepthErrorSettings, metadata={"formerly": "doubt"})
     """Of computed depth."""
 
 
@@ -89,11 +89,11 @@ class LearnedDiscoverer(CloudDiscoverer):
         cut = cut_cloud(surface, self._weights, self._learned.cut)
         if around.computed:
             cut = self._as_sure_as_depth(views, surface, cut, planes)
-        listed = (cut.told.whole >= self._learned.least_confidence) | (cut.told.structure > 0.5)
+        listed = (cut.verdicts.whole >= self._learned.least_confidence) | (cut.verdicts.structure > 0.5)
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(self._weights)
         kept, features = _described(cloud, parted, up, views.unit, names)
-        scraps = cut.only(~listed & (cut.told.whole >= self._learned.least_scrap))
+        scraps = cut.only(~listed & (cut.verdicts.whole >= self._learned.least_scrap))
         self._scraps = _described(cloud, scraps, up, views.unit, names)
         return cloud, kept, features
 
@@ -101,7 +101,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         self, views: ChunkViews, surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane]
     ) -> CloudCut:
         """The cut without what errors of computed depth explain."""
-        s, doubt = self._learned.doubt, voxel_doubt(views, surface.cloud)
+        s, doubt = self._learned.depth_errors, voxel_doubt(views, surface.cloud)
         cut = without_bends(surface, cut, planes, doubt, s)
         return without_slivers(surface.cloud, cut, doubt, s, 0.5 * self._learned.least_confidence)
 
@@ -112,8 +112,8 @@ def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudC
     What lies off all of them (a ledge, a bit of a neighbour) is of none, so that walls stay flat; a thing of which
     nothing is left is left out.
     """
-    labels, origin = cut.labels.copy(), list(range(len(cut.told.structure)))
-    for number in np.flatnonzero(cut.told.structure > 0.5).tolist():
+    labels, origin = cut.labels.copy(), list(range(len(cut.verdicts.structure)))
+    for number in np.flatnonzero(cut.verdicts.structure > 0.5).tolist():
         mine = np.flatnonzero(cut.labels == number)
         faces = _faces(cloud, mine, planes)
         if faces:
@@ -123,7 +123,7 @@ def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudC
                 labels[mine[nearest == k]] = len(origin)
                 origin.append(number)
             labels[mine[height.min(axis=0) > OFF_WALL * cloud.voxel + 3.0 * cloud.sigma[mine]]] = -1
-    parted = CloudCut(labels, cut.told.rows(np.array(origin, np.int64)))
+    parted = CloudCut(labels, cut.verdicts.rows(np.array(origin, np.int64)))
     return parted.only(np.bincount(labels[labels >= 0], minlength=len(origin)) > 0)
 
 
@@ -158,16 +158,16 @@ def _described(
     cloud: Cloud, cut: CloudCut, up: NDArray[np.float64], unit: float, names: Sequence[str]
 ) -> tuple[Segmentation, Features]:
     """The segments of a cut and their features."""
-    rgb, count = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8), len(cut.told.structure)
+    rgb, count = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8), len(cut.verdicts.structure)
     order = np.argsort(cut.labels, kind="stable")
     bounds = np.searchsorted(cut.labels[order], np.arange(count + 1))
-    segments, features, named = [], np.zeros((count, 64), np.float32), _named(cut.told, names)
+    segments, features, named = [], np.zeros((count, 64), np.float32), _named(cut.verdicts, names)
     for number in range(count):
         mine = order[bounds[number] : bounds[number + 1]]
-        structure = bool(cut.told.structure[number] > 0.5)
+        structure = bool(cut.verdicts.structure[number] > 0.5)
         features[number] = object_feature(cloud.points[mine], rgb[mine], up, unit)
         plane = _plane_of(cloud, mine, unit)
-        score = 0.95 if structure else float(cut.told.whole[number])
+        score = 0.95 if structure else float(cut.verdicts.whole[number])
         segments.append(Segment(plane, structure, score, named=named[number]))
     return Segmentation(np.asarray(cut.labels + 1, np.int32), tuple(segments), up), features
 

@@ -9,7 +9,7 @@ import numpy as np
 from list3r.memory.change.ledger import ChangeLedger, Group
 from list3r.memory.library.region import DirtySet, Region
 from list3r.memory.merging.edges import NONE, form_groups
-from list3r.memory.merging.moving import Mover, join_movers, tied_movers
+from list3r.memory.merging.movers import Mover, join_movers, tied_movers
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.records import MergeDecision
 

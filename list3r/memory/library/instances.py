@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Swatch, dominant_colors
 from list3r.memory.description.describe import shape_word
 from list3r.memory.geometry import Array, Sim3
-from list3r.memory.merging.moving import Mover
+from list3r.memory.merging.movers import Mover
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import BestView

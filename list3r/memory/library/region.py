@@ -18,7 +18,7 @@ from list3r.memory.library.rows import pack_scores, unpack_scores
 from list3r.memory.library.rules import ConsolidationSettings, World
 from list3r.memory.library.settled_poses import extent_of, neighbours
 from list3r.memory.merging.edges import Links, links_of
-from list3r.memory.merging.moving import PlacedChunks, Tracks, without_moving
+from list3r.memory.merging.movers import PlacedChunks, Tracks, without_moving
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, pair_scores
 from list3r.memory.overlap.summaries import ChunkSummary, Summaries

@@ -16,7 +16,7 @@ from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.instances import DeriveSettings
 from list3r.memory.library.labels import LabelSettings
 from list3r.memory.library.settled_poses import HysteresisSettings
-from list3r.memory.merging.moving import MovingSettings
+from list3r.memory.merging.movers import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
 from list3r.memory.overlap.planes import place_planes
 from list3r.memory.overlap.summaries import Summaries, cameras_of, is_known, light_of, sample_of, world_unit
