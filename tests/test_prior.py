@@ -15,7 +15,7 @@ from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, FrameSamples,
 from list3r.pipeline.session import check_buildable, resolve_settings
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Reconstruction
-from list3r.reconstruction.motion import movers
+from list3r.reconstruction.motion import residuals
 from list3r.reconstruction.prior import PriorSettings, bridged, mean_alignment, source_from_chunk, steady_runs
 from list3r.reconstruction.rgbd.odometry import CameraTracker, TrackedSegment
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
@@ -132,9 +132,9 @@ def test_a_surface_that_seems_to_move_does_not_free_the_camera_from_its_prior(tr
     half = np.zeros_like(view.valid)
     half[:, : half.shape[1] // 2] = True
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(movers, "register", spy)
-        patch.setattr(movers, "suspects", lambda *_: [half])
-        movers.find_mover(model, view, np.eye(4), found, settings, prior)
+        patch.setattr(residuals, "register", spy)
+        patch.setattr(residuals, "suspects", lambda *_: [half])
+        residuals.find_mover(model, view, np.eye(4), found, settings, prior)
     assert told
     assert all(one is prior for one in told)
 
