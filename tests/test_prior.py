@@ -134,7 +134,7 @@ def test_a_surface_that_seems_to_move_does_not_free_the_camera_from_its_prior(tr
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(residuals, "register", spy)
         patch.setattr(residuals, "suspects", lambda *_: [half])
-        residuals.find_mover(model, view, np.eye(4), found, settings, prior)
+        residuals.mover_in_residuals(model, view, np.eye(4), found, settings, prior)
     assert told
     assert all(one is prior for one in told)
 
