@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--methods", default="learned,true", help="of learned, true")
     parser.add_argument("--sensor", help="structured, tof, lidar or computed; without it each world draws one")
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
-    parser.add_argument("--house", type=Path, help="folder of aws-robomaker-small-house-world; walks there, not worlds")
+    parser.add_argument("--house", type=Path, help="folder of a Gazebo world, or a labelled scan (PCD); walks there")
     parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
     parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it beside")
     parser.add_argument("--json", type=Path)

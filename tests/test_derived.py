@@ -6,10 +6,12 @@ import gc
 import weakref
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r.memory.overlap.summaries import SummaryCache
+from list3r.memory.overlap.summaries import SummaryCache, sample_of
+from list3r.memory.store.checksums import side_by_side
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
 
@@ -50,3 +52,30 @@ def test_each_store_has_its_own_objects_and_drops_them(tmp_path: Path) -> None:
 def test_objects_are_told_apart_by_class() -> None:
     derived = Derived()
     assert derived.of(list) is derived.of(list) and derived.of(dict) == {}
+
+
+def test_what_nobody_asked_for_in_the_last_turns_is_dropped() -> None:
+    kept: LruCache[str, str] = LruCache(100, len, turns=2)
+    kept.put("left", "behind")
+    kept.put("asked", "again")
+    for _ in range(3):
+        assert kept.get("asked") == "again"
+        kept.end_turn()
+    assert kept.get("left") is None and len(kept) == 1
+    kept.put("large", "x" * 95)
+    assert kept.get("asked") == "again"
+
+
+@pytest.mark.parametrize("count", [1, 64, 65, 128, 129, 300, 1000, 1025])
+def test_the_sample_of_a_longer_walk_is_some_of_the_earlier_one_and_later_chunks(count: int) -> None:
+    sample = sample_of(range(count))
+    assert min(count, 33) <= len(sample) <= 64
+    for longer in range(count, 2 * count):
+        assert {k for k in sample_of(range(longer)) if k < count} <= set(sample)
+
+
+def test_parts_side_by_side_are_all_parts_in_runs_of_one_table() -> None:
+    parts = [("frames", (1 << 32) + k) for k in (0, 1, 2)] + [("chunks", k) for k in range(1500) if k != 7]
+    runs = list(side_by_side(reversed(parts)))
+    assert [(name, k) for name, run in runs for k in run] == sorted(parts)
+    assert [len(run) for _, run in runs] == [7, 1000, 492, 3]

@@ -61,18 +61,11 @@ def read_scan(file: Path) -> tuple[list[TexturedMesh], list[int], list[Truth]]:
 
 def _read_pcd(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return points (N, 3) and labels (N,), without points at the origin, which scanners write for none."""
-    content = file.read_bytes()
-    head, _, body = content.partition(b"\nDATA ")
-    kind, _, body = body.partition(b"\n")
-    if b"FIELDS x y z label" not in head or kind not in (b"ascii", b"binary"):
-        raise SourceError(
-            f"{file.name} is no point cloud with labels: PCD with x, y, z, label, not compressed, is read"
-        )
-    if kind == b"ascii":
-        table = np.array(body.split(), np.float64).reshape(-1, 4)
-        points, label = table[:, :3], table[:, 3].astype(np.int64)
-    else:
-        rows = np.frombuffer(body, [("xyz", "<f4", 3), ("label", "<u4")], len(body) // 16)
-        points, label = rows["xyz"].astype(np.float64), rows["label"].astype(np.int64)
+    import open3d as o3d
+
+    found = o3d.t.io.read_point_cloud(str(file))
+    if "positions" not in found.point or "label" not in found.point:
+        raise SourceError(f"{file.name} is no point cloud with labels: PCD with x, y, z and label is read")
+    points, label = found.point["positions"].numpy().astype(np.float64), found.point["label"].numpy().ravel()
     known = np.isfinite(points).all(axis=1) & (np.abs(points[:, :2]).max(axis=1) > 0)
-    return points[known], label[known]
+    return points[known], label[known].astype(np.int64)
