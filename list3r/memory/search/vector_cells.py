@@ -1,8 +1,9 @@
 """The cells of the inverted file of a large space: learned once, kept in the user's cache, of use even when outdated.
 
-What is kept is where each vector belongs, not the vectors: a memory answers with what its file holds. A vector that has
-changed since, or has come in, is looked at again as the index is filled. So what is kept may be thrown away, and can at
-worst hide a candidate; it lies with the user and not with the memory, so that no file of a stranger brings one along.
+What is kept is where each vector belongs, not the vectors: a memory answers with what its file holds. The checksums of
+the file tell which parts of it are as they were; a vector that has changed since, or has come in, is looked at again as
+the index is made. So what is kept may be thrown away, and can at worst hide a candidate; it lies with the user and not
+with the memory, so that no file of a stranger brings one along.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +59,8 @@ class Cells:
     """Tell whether a vector is still the same. Shape (N,)."""
     cells: NDArray[np.int32]
     """Shape (N,)."""
+    seals: dict[int, bytes] = field(default_factory=dict)
+    """State of the parts of the table of vectors in which they were read."""
     _new: list[tuple[NDArray[np.int64], NDArray[np.uint32], NDArray[np.int32]]] = field(default_factory=list)
     asked: int = 0
     """Vectors of which it was asked, and """
@@ -86,6 +90,15 @@ class Cells:
             empty.astype(np.int32),
         )
 
+    def take_over(self, parts_of: NDArray[np.int64], same: set[int]) -> NDArray[np.bool_]:
+        """Begin with the vectors that stand in parts that are the same; tell which these are. `parts_of` and what is
+        returned have shape (N,).
+        """
+        held = np.isin(parts_of, np.fromiter(same, np.int64, len(same)))
+        self.asked, self.unknown = int(held.sum()), 0
+        self._new = [(self.ids[held], self.marks[held], self.cells[held])]
+        return held
+
     def of(self, quantizer: faiss.Index, ids: NDArray[np.int64], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the cells of unit vectors (n, D) of some ids; those that are not known are looked for. Shape (n,)."""
         marks = _marks(vectors)
@@ -107,16 +120,26 @@ class Cells:
         """Whether most of what was asked for is not what the cells were learned on; after learning it is not."""
         return len(self.ids) > 0 and self.unknown > _STALE * max(self.asked, 1)
 
-    def save(self, path: Path) -> None:
-        """Keep what was asked for; where that cannot be, nothing is kept."""
-        if self.unknown == 0 and self.asked == len(self.ids):
+    def save(self, path: Path, seals: Mapping[int, bytes]) -> None:
+        """Keep what was asked for, in this state of the parts of their table; where that cannot be, nothing is kept."""
+        known = {part: seal for part, seal in seals.items() if seal}
+        if self.seals == known:
             return
         ids, marks, cells = (np.concatenate(parts) for parts in zip(*self._new, strict=True))
+        order = np.argsort(ids)
         new = path.with_name(f"{path.name}-{os.getpid()}")
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             with new.open("wb") as file:
-                np.savez(file, centroids=self.centroids, ids=ids, marks=marks, cells=cells)
+                np.savez(
+                    file,
+                    centroids=self.centroids,
+                    ids=ids[order],
+                    marks=marks[order],
+                    cells=cells[order],
+                    parts=np.fromiter(known, np.int64, len(known)),
+                    seals=np.frombuffer(b"".join(known.values()), "<u4"),
+                )
             new.replace(path)
             files = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
             for old in files[:-_MOST_FILES]:
@@ -132,8 +155,9 @@ class Cells:
                 arrays["ids"].astype(np.int64),
                 arrays["marks"].astype(np.uint32),
                 arrays["cells"].astype(np.int32),
+                dict(zip(arrays["parts"].tolist(), _in_fours(arrays["seals"]), strict=True)),
             )
-        except (OSError, KeyError, MemoryFileError):
+        except (OSError, KeyError, ValueError, MemoryFileError):
             return None
         n, c = len(kept.ids), len(kept.centroids)
         fits = kept.centroids.shape == (c, dimension) and kept.marks.shape == kept.cells.shape == kept.ids.shape == (n,)
@@ -155,6 +179,11 @@ def _cache_folder() -> Path:
         return Path(os.environ["LIST3R_CACHE"])
     home = os.environ.get("XDG_CACHE_HOME")
     return (Path(home) if home else Path("~/.cache").expanduser()) / "list3r"
+
+
+def _in_fours(seals: NDArray[np.uint32]) -> list[bytes]:
+    data = seals.astype("<u4").tobytes()
+    return [data[n : n + 4] for n in range(0, len(data), 4)]
 
 
 def _marks(vectors: NDArray[np.float32]) -> NDArray[np.uint32]:

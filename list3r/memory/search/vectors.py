@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
+from list3r.memory.search.inverted_file import InvertedFile, unit
 from list3r.memory.search.vector_cells import Cells, cache_file, cell_count, sample_size
 from list3r.memory.store.store import Store
 
@@ -51,7 +52,7 @@ class VectorIndex:
     dimension: int
     count: int
     """Vectors in `index`."""
-    index: faiss.Index
+    index: faiss.Index | InvertedFile
     _made_of: int
     """State of the file as other processes left it."""
     _seen: int
@@ -88,7 +89,7 @@ class VectorIndex:
         ids, vectors = store.embeddings.of(self.space, changed)
         if len(ids) and vectors.shape[1] != self.dimension:
             return False
-        self._fresh = (ids, _unit(vectors)) if len(ids) else None
+        self._fresh = (ids, unit(vectors)) if len(ids) else None
         self._stale, self._stamp = frozenset(changed), stamp
         return True
 
@@ -111,11 +112,11 @@ class VectorIndex:
 
     def _ranked(self, store: Store, query: NDArray[np.float32], width: int, probed: int) -> list[tuple[int, float]]:
         """Return the best `width` or so of the index and all that has changed, by exact cosine."""
-        score, at = _ask(self.index, query, min(width, self.count), probed)
+        score, at = _ask(self.index, store, query, min(width, self.count), probed)
         found = [(int(n), float(s)) for n, s in zip(at, score, strict=True) if n >= 0 and int(n) not in self._stale]
         if self.count > _EXACT:
             ids, vectors = store.embeddings.of(self.space, [n for n, _ in found])
-            found = list(zip(ids.tolist(), (_unit(vectors) @ query).tolist(), strict=True)) if len(ids) else []
+            found = list(zip(ids.tolist(), (unit(vectors) @ query).tolist(), strict=True)) if len(ids) else []
         if self._fresh is not None:
             found += zip(self._fresh[0].tolist(), (self._fresh[1] @ query).tolist(), strict=True)
         return sorted(found, key=lambda x: (-x[1], x[0]))
@@ -175,7 +176,7 @@ def _chosen_space(store: Store, space: str | None) -> str:
 
 
 def _build(store: Store, space: str, stamp: tuple[int, int, bool]) -> VectorIndex:
-    """Read all vectors once, a batch at a time."""
+    """Read what has to be read now, a batch at a time."""
     import faiss
 
     count = store.embeddings.count(space)
@@ -194,65 +195,52 @@ def _flat(store: Store, space: str) -> tuple[Any, int]:
     for ids, vectors in store.embeddings.batches(space):
         if index is None:
             index = faiss.IndexIDMap(faiss.IndexFlatIP(vectors.shape[1]))
-        index.add_with_ids(_unit(vectors), ids)
+        index.add_with_ids(unit(vectors), ids)
         total += len(ids)
     return index, total
 
 
-def _inverted(store: Store, space: str, count: int) -> tuple[Any, int]:
-    """Return all vectors in half precision, in cells that are learned on a sample or were kept since they were."""
-    import faiss
-
-    pointer: Any = faiss.swig_ptr
+def _inverted(store: Store, space: str, count: int) -> tuple[InvertedFile, int]:
+    """Return all vectors in cells that are learned on a sample or were kept since they were, and how many."""
     place = cache_file(store.path, space)
-    dimension = next(store.embeddings.batches(space, 1))[1].shape[1]
-    cells = Cells.load(place, dimension, count)
+    seals = store.embeddings.seals()
+    cells = Cells.load(place, next(store.embeddings.batches(space, 1))[1].shape[1], count)
     while True:
         if cells is None:
-            cells = Cells.learned(_unit(store.embeddings.sample(space, sample_size(count))), count)
-        index, quantizer = _empty(cells, dimension)
-        total = 0
-        for ids, vectors in store.embeddings.batches(space):
-            unit = _unit(vectors)
-            placed = cells.of(quantizer, ids, unit)
-            index.add_core(len(ids), pointer(unit), pointer(ids), pointer(placed))
-            total += len(ids)
+            cells = Cells.learned(unit(store.embeddings.sample(space, sample_size(count))), count)
+        index, total = _filled(store, space, cells, seals)
+        if total != count:  # the checksums leave vectors out: all are read, which finds what is damaged
+            cells.seals.clear()
+            index, total = _filled(store, space, cells, None)
         if not cells.outdated:
-            cells.save(place)
+            cells.save(place, seals)
             return index, total
         cells = None
 
 
-def _empty(cells: Cells, dimension: int) -> tuple[Any, Any]:
-    """Return an inverted file without vectors, and the index of its cells."""
-    import faiss
-
-    quantizer = faiss.IndexFlatIP(dimension)
-    quantizer.add(cells.centroids)
-    index = faiss.IndexIVFScalarQuantizer(
-        quantizer, dimension, len(cells.centroids), faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT
-    )
-    index.by_residual = False
-    index.train(cells.centroids)  # half precision needs no training; this says that the cells are there
-    return index, quantizer
+def _filled(store: Store, space: str, cells: Cells, seals: Mapping[int, bytes] | None) -> tuple[InvertedFile, int]:
+    """Return the vectors in their cells, and how many: those in parts of the table that are as they were are left to be
+    read when they are asked for. Without `seals` all are read.
+    """
+    index = InvertedFile(space, cells.centroids)
+    same = {part for part, seal in (seals or {}).items() if cells.seals.get(part) == seal}
+    held = cells.take_over(store.embeddings.parts_of(cells.ids), same)
+    index.leave(cells.ids[held], cells.cells[held])
+    total = int(held.sum())
+    table = store.embeddings
+    for ids, vectors in table.batches(space) if seals is None else table.in_parts(space, seals.keys() - same):
+        rows = unit(vectors)
+        index.add(ids, rows, cells.of(index.quantizer, ids, rows))
+        total += len(ids)
+    return index, total
 
 
 def _ask(
-    index: Any, query: NDArray[np.float32], width: int, probed: int
+    index: faiss.Index | InvertedFile, store: Store, query: NDArray[np.float32], width: int, probed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    import faiss
-
     if width == 0:
         return np.zeros(0, np.float32), np.zeros(0, np.int64)
-    if not hasattr(index, "nprobe"):
-        score, at = index.search(query[None], width)
-        return score[0], at[0]
-    options: Any = faiss.SearchParametersIVF()
-    options.nprobe = probed
-    score, at = index.search(query[None], width, params=options)
+    if isinstance(index, InvertedFile):
+        return index.search(store, query, width, probed)
+    score, at = index.search(query[None], width)
     return score[0], at[0]
-
-
-def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.ascontiguousarray(vectors / np.maximum(length, 1e-12), dtype=np.float32)

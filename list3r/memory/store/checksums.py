@@ -29,7 +29,7 @@ OWN_CRC: Mapping[str, tuple[str, ...]] = {
 
 SUMS_SINCE = 3
 """The first schema whose rows are summed."""
-_ROWS_OF_A_PART = 4
+PART_BITS = 4
 """Two to the power of this: how many neighbouring ids share a part."""
 _FRAMES_OF_A_PART = 6
 _SESSION_BITS = 32
@@ -61,13 +61,13 @@ class SummedTable:
             return f"((%s.session_id << {_SESSION_BITS}) | (%s.frame_index >> {_FRAMES_OF_A_PART}))"
         if first == "chunk_id" and len(self.key) > 1:
             return f"%s.{first}"
-        return f"(%s.{first} >> {_ROWS_OF_A_PART})" if self.numbered else "0"
+        return f"(%s.{first} >> {PART_BITS})" if self.numbered else "0"
 
     def part_of_first(self, key: int) -> int:
         """The part of the rows whose first column of the key is this number; not for `frames`."""
         if self.key[0] == "chunk_id" and len(self.key) > 1:
             return key
-        return key >> _ROWS_OF_A_PART if self.numbered else 0
+        return key >> PART_BITS if self.numbered else 0
 
     def part_of(self, row: str) -> str:
         """`part` over the columns of a named row."""
@@ -82,7 +82,7 @@ class SummedTable:
             return "session_id = ? AND frame_index BETWEEN ? AND ?", (first >> _SESSION_BITS, *frames)
         if not self.numbered:
             return "1", ()
-        bits = 0 if self.key[0] == "chunk_id" and len(self.key) > 1 else _ROWS_OF_A_PART
+        bits = 0 if self.key[0] == "chunk_id" and len(self.key) > 1 else PART_BITS
         return f"{self.key[0]} BETWEEN ? AND ?", (first << bits, (last + 1 << bits) - 1)
 
 
@@ -256,6 +256,14 @@ def _unsealed(name: str, part: object, sealed: object) -> list[bytes] | None:
 
 def _seal(name: str, part: int, crcs: bytes) -> bytes:
     return zlib.crc32(f"{name}:{part}:".encode() + crcs).to_bytes(4, "little")
+
+
+def stored_seals(database: sqlite3.Connection, table: str) -> dict[int, bytes]:
+    """What changes when any row of a part does, by part: the CRC-32 over the sums of its rows, which says nothing of
+    whether the rows still match these. Parts whose sums are none are left out.
+    """
+    query = "SELECT part, substr(crcs, -4) FROM sums WHERE name = ? AND typeof(part) = 'integer' ORDER BY part"
+    return {part: seal for part, seal in database.execute(query, (table,)) if type(seal) is bytes and len(seal) == 4}
 
 
 def bad_rows(database: sqlite3.Connection, version: int = SCHEMA_VERSION) -> Iterator[BadRow]:

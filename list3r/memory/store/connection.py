@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self, cast
 
 from list3r.memory.errors import MemoryFileError, OptionError
-from list3r.memory.store.checksums import Sums
+from list3r.memory.store.checksums import PART_BITS, Sums, stored_seals
 from list3r.memory.store.committed import Committed
 from list3r.memory.store.file import (
     check_beside,
@@ -353,8 +353,8 @@ class Connection:
     def believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
         if self._checks.by_part(table):
-            written = frozenset[int]() if self._sums is None else self._sums.touched(table)
-            asked = [row for row in rows if int(row[0]) >> 4 not in written]
+            sound, written = self._checks.sound_parts(table), self._written(table)
+            asked = [row for row in rows if (part := int(row[0]) >> PART_BITS) not in sound and part not in written]
             try:
                 bad = unbelieved(self._database, table, asked)
             except FAILURES as error:
@@ -362,6 +362,19 @@ class Connection:
             self.refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
             self._checks.keep_sound(table, (row[0] for row in asked))
         return rows
+
+    def _written(self, table: str) -> frozenset[int]:
+        """Parts of a table that the transaction that runs has changed."""
+        return frozenset() if self._sums is None else self._sums.touched(table)
+
+    def seals(self, table: str) -> dict[int, bytes]:
+        """What changes when any row of a part of a table does, by part; empty for those that the transaction that runs
+        has changed.
+        """
+        try:
+            return stored_seals(self._database, table) | dict.fromkeys(self._written(table), b"")
+        except FAILURES as error:
+            raise MemoryFileError(explained(self.path, error)) from error
 
     def rows_unchecked(self, table: str, ids: Iterable[int]) -> list[int]:
         """Those of some ids whose rows were not checked yet, of a table that is checked row by row."""

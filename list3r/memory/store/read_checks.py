@@ -11,12 +11,20 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from typing import Any
 
 import numpy as np
 
-from list3r.memory.store.checksums import OWN_CRC, bad_rows_of, own_crc_wrong, row_crc, side_by_side, summed_tables
+from list3r.memory.store.checksums import (
+    OWN_CRC,
+    PART_BITS,
+    bad_rows_of,
+    own_crc_wrong,
+    row_crc,
+    side_by_side,
+    summed_tables,
+)
 from list3r.memory.store.rows.values import bad_references, bad_values
 from list3r.memory.store.word_index import expected_words, up_to_date
 
@@ -61,7 +69,7 @@ class ReadChecks:
         """What was found; from then on every question is refused."""
         self._busy = False
         self._known = {*summed_tables(), BOXES, WORDS} - (set() if whole else _large(database))
-        self._sound_parts: set[tuple[str, int]] = set()
+        self._sound_parts: dict[str, set[int]] = {}
         self._sound_rows: dict[str, set[int]] = {}
         database.set_authorizer(self._note)
 
@@ -94,9 +102,13 @@ class ReadChecks:
     def found_in_parts(self, table: str, keys: Iterable[int]) -> str | None:
         """The first damage of the parts of a table that rows with these first keys lie in."""
         if self.damage is None and self.by_part(table):
-            fresh = {(table, summed_tables()[table].part_of_first(int(k))) for k in keys} - self._sound_parts
-            self.damage = self._found([*side_by_side(fresh)])
+            fresh = {summed_tables()[table].part_of_first(int(k)) for k in keys} - self.sound_parts(table)
+            self.damage = self._found([*side_by_side((table, part) for part in fresh)])
         return self.damage
+
+    def sound_parts(self, table: str) -> Set[int]:
+        """Parts of a table that were found sound."""
+        return self._sound_parts.get(table, frozenset())
 
     def keep_sound(self, table: str, ids: Iterable[int]) -> None:
         """Remember rows that were checked one by one."""
@@ -125,7 +137,7 @@ class ReadChecks:
                     self._checked.add(name)
                     self._read.discard(name)
                 else:
-                    self._sound_parts.update((name[0], part) for part in name[1])
+                    self._sound_parts.setdefault(name[0], set()).update(name[1])
             return None
         except FAILURES as error:
             return str(error)
@@ -193,14 +205,14 @@ def bad_words(database: sqlite3.Connection) -> Iterator[str]:
 
 def unbelieved(database: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
     """Ids of those of some whole rows of a table, the id first, that its checksums do not know."""
-    parts = sorted({int(row[0]) >> 4 for row in rows})
+    parts = sorted({int(row[0]) >> PART_BITS for row in rows})
     known: dict[int, bytes] = {}
     for start in range(0, len(parts), _PARTS):
         some = parts[start : start + _PARTS]
         query = f"SELECT part, crcs FROM sums WHERE name = ? AND part IN ({','.join('?' * len(some))})"
         for part, crcs in database.execute(query, (table, *some)):
             known[part] = crcs[: -4 - len(crcs) % 4] if isinstance(crcs, bytes) else b""
-    return [row[0] for row in rows if not _among(row_crc(row), known.get(int(row[0]) >> 4, b""))]
+    return [row[0] for row in rows if not _among(row_crc(row), known.get(int(row[0]) >> PART_BITS, b""))]
 
 
 def _among(crc: bytes, crcs: bytes) -> bool:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
+from list3r.memory.store.checksums import PART_BITS, side_by_side, summed_tables
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.table import batches
 
@@ -43,12 +44,31 @@ class Embeddings:
         self._connection.execute("DELETE FROM embeddings WHERE instance = ?", (instance_id,))
 
     def of(self, space: str, ids: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one."""
+        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one.
+
+        In a large file each is compared with its own checksum, without the rows that it stands among.
+        """
         rows: list[tuple[Any, ...]] = []
         for part, marks in batches(ids):
-            query = f"SELECT instance, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
-            rows += self._connection.rows(query, (*part, space))
-        return self._checked(sorted(rows), space)
+            query = f"SELECT instance, space, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
+            rows += self._connection.believed("embeddings", self._connection.rows(query, (*part, space)))
+        return _vectors([(instance, vector) for instance, _, vector in sorted(rows)], space)
+
+    def seals(self) -> dict[int, bytes]:
+        """Return what changes when any vector of a part of the table does, by part; empty where it is being written."""
+        return self._connection.seals("embeddings")
+
+    def parts_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the parts of the table in which the vectors of instances stand. Shape (N,) each."""
+        return ids >> PART_BITS
+
+    def in_parts(self, space: str, parts: Iterable[int]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+        """Yield ids (n,) and vectors (n, D) of a named space that stand in some parts of the table, in order of ids."""
+        for name, some in side_by_side(("embeddings", part) for part in parts):
+            where, bounds = summed_tables()[name].where(some)
+            query = f"SELECT instance, vector FROM embeddings WHERE {where} AND space = ? ORDER BY instance"
+            if rows := self._connection.rows(query, (*bounds, space)):
+                yield self._checked(rows, space)
 
     def batches(self, space: str, size: int = 20_000) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
         """Yield ids (n,) and vectors (n, D) of a named space, in order of ids, at most `size` at a time."""
@@ -86,14 +106,17 @@ class Embeddings:
 
 
 def _vectors(rows: Sequence[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Ids and vectors of rows of `embeddings`. Raises `MemoryFileError` where one has another length than the rest."""
+    """Ids and vectors of rows of `embeddings`. Raises `MemoryFileError` where one has another length than the rest, or
+    numbers that are none.
+    """
     if not rows:
         return np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
-    length = len(rows[0][1])
-    if length % 4 or any(len(row[1]) != length for row in rows):
-        bad = next(instance for instance, vector in rows if len(vector) != length or length % 4)
-        raise MemoryFileError(f"the vector of instance {bad} in the space {space} is damaged")
+    length = len(rows[0][1]) if type(rows[0][1]) is bytes else 0
+    bad = [n for n, v in rows if type(v) is not bytes or len(v) != length or length == 0 or length % 4]
     ids = np.fromiter((row[0] for row in rows), np.int64, len(rows))
-    return ids, np.frombuffer(b"".join(row[1] for row in rows), "<f4").reshape(len(rows), -1).astype(
-        np.float32, copy=False
-    )
+    if not bad:
+        vectors = np.frombuffer(b"".join(row[1] for row in rows), "<f4").reshape(len(rows), -1)
+        bad = ids[~np.isfinite(vectors).all(axis=1)].tolist()
+    if bad:
+        raise MemoryFileError(f"the vector of instance {bad[0]} in the space {space} is damaged")
+    return ids, vectors.astype(np.float32, copy=False)
