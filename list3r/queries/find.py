@@ -81,20 +81,21 @@ def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
         return None
     gathered = Gathered(store)
     total = dict(gathered.named(words))
-    ranks = {n: r for n, r in store.instances.ranks(list(total)).items() if r[1] != "removed"}
-    if STRUCTURE.isdisjoint(words) and any(structure is None for _, _, structure in ranks.values()):
-        ranks = {n: r for n, r in ranks.items() if r[2] is None}
-    if not ranks:
+    ranks = store.instances.ranks(np.fromiter(total, np.int64, len(total)))
+    ranks = ranks.among(~ranks.removed)
+    if STRUCTURE.isdisjoint(words) and not ranks.structure.all():
+        ranks = ranks.among(~ranks.structure)
+    if len(ranks.ids) == 0:
         return None
-    order = sorted(ranks, key=lambda n: (-total[n], -ranks[n][0], n))
-    named = f"named {' '.join(words)}"
-    scores = {n: total[n] / (100 * len(words)) for n in order}
-    best = store.instances.of(order[:k])
+    scores = np.array([total[n] for n in ranks.ids.tolist()]) / (100 * len(words))
+    order = np.lexsort((ranks.ids, -ranks.confidence, -scores))[:k]
+    best = store.instances.of(ranks.ids[order].tolist())
     store.words.check(best, words, total)
-    matches = [Match(i, round(scores[i.id], 4), None, None, named) for i in best]
-    equal = sum(score > scores[order[0]] - _EQUAL for score in scores.values())
+    score = dict(zip(ranks.ids[order].tolist(), scores[order].tolist(), strict=True))
+    matches = [Match(i, round(score[i.id], 4), None, None, f"named {' '.join(words)}") for i in best]
+    equal = int((scores > scores.max() - _EQUAL).sum())
     notes = [f"{equal} instances match equally well; add words to tell them apart"] if equal > 1 and k > 1 else []
-    return Found(matches, (*gathered.notes, *notes), (), len(order))
+    return Found(matches, (*gathered.notes, *notes), (), len(ranks.ids))
 
 
 # ---------------------------------------------------------------------------------------------- phrases

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -24,6 +24,8 @@ from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.relations import RelationTable
 
 Array = NDArray[np.float64]
+_KEPT_RANKS = 500_000
+"""Instances whose ranks are kept; 9 MB."""
 
 
 def _pack_geometry(center: Array, aabb: Array, box: OrientedBox) -> tuple[bytes]:
@@ -63,6 +65,48 @@ _COLUMNS = Columns(
 )
 
 
+@dataclass(frozen=True)
+class Ranks:
+    """What orders instances among those that words name equally well."""
+
+    ids: NDArray[np.int64]
+    """Ascending. Shape (N,)."""
+    confidence: Array
+    """Shape (N,)."""
+    removed: NDArray[np.bool_]
+    """Whether it is known to be gone. Shape (N,)."""
+    structure: NDArray[np.bool_]
+    """Shape (N,)."""
+
+    def among(self, chosen: NDArray[Any]) -> Ranks:
+        """Return those at some places."""
+        return Ranks(self.ids[chosen], self.confidence[chosen], self.removed[chosen], self.structure[chosen])
+
+    def with_more(self, other: Ranks) -> Ranks:
+        """Return these and others."""
+        names = [f.name for f in fields(self)]
+        both = Ranks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+        return both.among(np.argsort(both.ids))
+
+
+def _is_in(ids: NDArray[np.int64], known: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which of some ids are among others, ascending."""
+    if len(known) == 0:
+        return np.zeros(len(ids), bool)
+    return np.asarray(known[np.minimum(np.searchsorted(known, ids), len(known) - 1)] == ids)
+
+
+def _ranks(rows: Sequence[tuple[Any, ...]]) -> Ranks:
+    """Ranks of rows (id, confidence, state, structure)."""
+    ids, confidence, state, structure = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return Ranks(
+        np.array(ids, np.int64),
+        np.array(confidence, np.float64),
+        np.array([s == "removed" for s in state], bool),
+        np.array([s is not None for s in structure], bool),
+    )
+
+
 class Instances:
     """The table of instances and the R*Tree of their boxes. What writes is called inside `transaction()`."""
 
@@ -79,6 +123,9 @@ class Instances:
         self._library = library
         self._embeddings, self._relations, self._events, self._labels = of_instance
         self._rows = Table(connection, "instances", _COLUMNS, "id", checked=True)
+        self._ranked = _ranks([])
+        self._ranked_in: object = None
+        """State of the file in which they were read."""
 
     def all(self, *, structure: bool | None = None) -> list[Instance]:
         """Return all instances by id; only structure or only things where asked."""
@@ -113,12 +160,20 @@ class Instances:
         if alias_of is not None:
             self._ids.add_aliases({instance_id: alias_of})
 
-    def ranks(self, ids: Sequence[int]) -> dict[int, tuple[float, str, str | None]]:
-        """Return confidence, state and structure of some instances, by id: what answers are ordered by, before those
-        are read that are given.
+    def ranks(self, ids: NDArray[np.int64]) -> Ranks:
+        """Return what answers are ordered by, before those are read that are given, of those of some ids that are
+        there, ascending. Kept while the file stays as it is.
         """
-        rows = self._rows.columns_of(("id", "confidence", "state", "structure"), ids)
-        return {n: (float(confidence), state, structure) for n, confidence, state, structure in rows}
+        state = self._connection.stamp()
+        if state != self._ranked_in or len(self._ranked.ids) > _KEPT_RANKS:
+            self._ranked, self._ranked_in = _ranks([]), state
+        wanted = np.sort(ids)
+        fresh = wanted[~_is_in(wanted, self._ranked.ids)]
+        if len(fresh):
+            rows = self._rows.columns_of(("id", "confidence", "state", "structure"), fresh.tolist())
+            self._ranked = self._ranked.with_more(_ranks(list(rows)))
+        held = wanted[_is_in(wanted, self._ranked.ids)]
+        return self._ranked.among(np.searchsorted(self._ranked.ids, held))
 
     def states(self) -> dict[int, tuple[str, int]]:
         """Return state and component of every instance, by id."""

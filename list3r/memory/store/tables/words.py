@@ -61,9 +61,9 @@ class Words:
     def _bearing_frequent(self, words: Sequence[str], limit: int) -> list[tuple[int, int]]:
         (ids, total), *others = sorted((self._bearers(word) for word in words), key=lambda b: len(b[0]))
         for other, weights in others:
-            at = np.minimum(np.searchsorted(other, ids), len(other) - 1)
-            both = other[at] == ids
-            ids, total = ids[both], total[both] + weights[at[both]]
+            both = np.isin(ids, other, assume_unique=True)
+            ids, total = ids[both], total[both]
+            total = total + weights[np.searchsorted(other, ids)]
         order = np.argsort(-total, kind="stable")[:limit]
         return list(zip(ids[order].tolist(), total[order].tolist(), strict=True))
 
