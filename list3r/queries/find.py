@@ -14,7 +14,7 @@ from list3r.queries.finding.free_words import WordEncoder, like, named_by_vector
 from list3r.queries.finding.grammar import SIZES, SUPERLATIVES, Phrase, parse
 from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
 from list3r.queries.finding.words import STRUCTURE, no_such_words
-from list3r.queries.match import Match, Matches, checked_count, checked_instance
+from list3r.queries.match import Match, Matches, checked_count, checked_instance, of_one_state
 from list3r.queries.relations import Place, viewer_from
 from list3r.queries.views.gather import Gathered, gather, is_large
 
@@ -44,6 +44,7 @@ class Found(Matches):
         return len(self) > 1 and self[0].score - self[1].score < _EQUAL
 
 
+@of_one_state
 def find(
     store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> Found:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypedDict
+from functools import wraps
+from typing import ParamSpec, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +53,25 @@ class Matches(list[Match]):
         """What a reader should know, such as what was left out."""
         self.total = total
         """How many answer in all, those that are not in the list too; None where the question stops at the k-th."""
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def of_one_state(query: Callable[P, R]) -> Callable[P, R]:
+    """Return a query of a store, its first argument, that reads one state of it, whatever is written meanwhile. One
+    look at the file for all statements takes less time, too.
+    """
+
+    @wraps(query)
+    def asked(*args: P.args, **options: P.kwargs) -> R:
+        store = args[0]
+        assert isinstance(store, Store)
+        with store.snapshot():
+            return query(*args, **options)
+
+    return asked
 
 
 class FilterOptions(TypedDict, total=False):

@@ -22,6 +22,7 @@ from list3r.queries.match import (
     checked_instance,
     checked_length,
     checked_point,
+    of_one_state,
 )
 from list3r.queries.views.best_first import NearestSearch, box_gaps, nearest_first
 from list3r.queries.views.gather import is_large
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from list3r.queries.finding.free_words import WordEncoder
 
 
+@of_one_state
 def nearest(
     store: Store,
     *,

@@ -256,7 +256,7 @@ class _PictureCameras:
     """The cameras of posed keyframes whose picture is stored, kept while the memory stays as it is."""
 
     def __init__(self) -> None:
-        self._stamp: tuple[int, int, bool] | None = None
+        self._stamp: tuple[int, int, int] | None = None
         self._cameras: list[tuple[PosedCamera, int]] = []
         """In the order of session and frame, with the chunk that keeps the picture."""
         self._T_cam_world = np.zeros((0, 4, 4))

@@ -8,7 +8,7 @@ from typing import Unpack
 from list3r.memory.errors import OptionError, check_share
 from list3r.memory.records import BestView
 from list3r.memory.store.store import Store
-from list3r.queries.match import FilterOptions, Filters, Match, checked_instance
+from list3r.queries.match import FilterOptions, Filters, Match, checked_instance, of_one_state
 from list3r.queries.views.camera import PosedCamera
 from list3r.queries.views.visibility import Visibility, in_front, look
 
@@ -75,6 +75,7 @@ def _spans(frames: list[Sighting], gap_s: float) -> tuple[tuple[int, float, floa
     return tuple(out)
 
 
+@of_one_state
 def visible(
     store: Store,
     camera: PosedCamera,

@@ -12,12 +12,13 @@ from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.records import Instance
 from list3r.memory.search.vectors import VectorIndex
 from list3r.memory.store.store import Store
-from list3r.queries.match import FilterOptions, Filters, Match, checked_count, checked_instance
+from list3r.queries.match import FilterOptions, Filters, Match, checked_count, checked_instance, of_one_state
 
 _BATCH = 500
 """Instances that are loaded at once."""
 
 
+@of_one_state
 def similar(
     store: Store,
     *,

@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
-from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point
+from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point, of_one_state
 from list3r.queries.seen import LEAST_VISIBLE, visible
 from list3r.queries.views.camera import PosedCamera
-from list3r.queries.views.surfaces import distance_to_point, surface_of
+from list3r.queries.views.surfaces import distance_to_point, surfaces_of
 
 
+@of_one_state
 def within(
     store: Store,
     *,
@@ -50,8 +51,9 @@ def within(
         low, high, structure=filters.structure, min_confidence=filters.min_confidence, state=filters.stored_state
     )
     found = []
-    for i in filters.select(store.instances.of(sorted(ids.tolist()))):
-        points = surface_of(store, i).points
+    things = filters.select(store.instances.of(sorted(ids.tolist())))
+    for i, surface in zip(things, surfaces_of(store, things), strict=True):
+        points = surface.points
         if reach is None:
             inside = np.all((points >= low) & (points <= high), axis=1)
         else:

@@ -79,7 +79,7 @@ class VectorIndex:
             found = held[chosen] = _build(store, chosen, stamp)
         return found
 
-    def _caught_up(self, store: Store, stamp: tuple[int, int, bool]) -> bool:
+    def _caught_up(self, store: Store, stamp: tuple[int, int, int]) -> bool:
         """Take in what the store has changed since; False when that is so much that building again is better."""
         if stamp == self._stamp:
             return True
@@ -175,7 +175,7 @@ def _chosen_space(store: Store, space: str | None) -> str:
     return space
 
 
-def _build(store: Store, space: str, stamp: tuple[int, int, bool]) -> VectorIndex:
+def _build(store: Store, space: str, stamp: tuple[int, int, int]) -> VectorIndex:
     """Read what has to be read now, a batch at a time."""
     import faiss
 

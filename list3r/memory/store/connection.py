@@ -327,9 +327,9 @@ class Connection:
             self._held_version = int(self.rows("PRAGMA data_version")[0][0])
         return self._held_version
 
-    def stamp(self) -> tuple[int, int, bool]:
+    def stamp(self) -> tuple[int, int, int]:
         """Changes whenever the content may have: by other processes, by this store, by a rollback."""
-        return self.data_version, self._database.total_changes, self._database.in_transaction
+        return self.data_version, self._database.total_changes, self.rollbacks
 
     def rows(self, query: str, arguments: Arguments = ()) -> list[tuple[Any, ...]]:
         """All rows of a question, checked as `read_checks` says."""

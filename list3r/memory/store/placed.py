@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,6 +78,11 @@ class Surfaces:
     def points(self, instance_id: int) -> NDArray[np.float32]:
         """Return the surface points of one instance (no alias), wherever they were seen. Shape (N, 3)."""
         return self._in_world([(p.chunk_id, p.support.points) for p in self._supports.of(instance_id)])
+
+    def points_of_each(self, ids: Sequence[int]) -> dict[int, NDArray[np.float32]]:
+        """Return `points` of some instances, by id, where there are any."""
+        found = self._supports.of_each(ids)
+        return {n: self._in_world([(p.chunk_id, p.support.points) for p in parts]) for n, parts in found.items()}
 
     def _in_world(self, parts: list[tuple[int, NDArray[np.float32]]]) -> NDArray[np.float32]:
         if not parts:

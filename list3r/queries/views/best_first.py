@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.match import Filters
-from list3r.queries.views.surfaces import STRAY
+from list3r.queries.views.surfaces import STRAY, surfaces_of
 
 _MOST = 300
 """More boxes than this in the first surroundings: smaller ones will do."""
@@ -110,7 +110,10 @@ def _measure(
             break
         fresh = [int(ids[n]) for n in part if int(ids[n]) not in measured and int(ids[n]) != search.leave_out]
         gap = dict(zip(ids[part].tolist(), gaps[part].tolist(), strict=True))
-        for i in store.instances.of(fresh):
+        read = store.instances.of(fresh)
+        for _ in surfaces_of(store, search.filters.select(read)[: max(k - len(best), 0)]):
+            pass  # these are measured in any case: their surfaces are read together
+        for i in read:
             if len(best) >= k and gap[i.id] > best[k - 1][0] + farther:
                 continue
             measured[i.id] = (search.measure(i), i) if search.filters.passes(i) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -23,6 +24,8 @@ STRAY = 2e-5
 """Points may lie this far outside their thing's box, by its size: the steps in which they are stored."""
 _SLACK = 0.02
 """Points this far outside of the box, as a share of its longest edge, still count as the instance's surface."""
+_READ = 50
+"""Instances whose surfaces are read together."""
 _KEPT_POINTS = 4_000_000
 """Points of surfaces that are kept for the next question, over all instances of a store."""
 
@@ -71,19 +74,29 @@ class SurfaceCache(LruCache[tuple[int, bytes], InstanceSurface]):
 
 def surface_of(store: Store, instance: Instance) -> InstanceSurface:
     """Return the surface of an instance: its support, or its box where it has none."""
+    return next(surfaces_of(store, [instance]))
+
+
+def surfaces_of(store: Store, instances: Sequence[Instance]) -> Iterator[InstanceSurface]:
+    """Yield the surfaces of instances, in order; those that are not kept are read together, some at a time."""
     known = store.derived.of(SurfaceCache)
-    stamp = instance.aabb.tobytes() + instance.center.tobytes() + instance.observations.to_bytes(8, "little")
-    key = instance.id, stamp
-    return known.get(key) or known.put(key, _surface(store, instance))
+    for start in range(0, len(instances), _READ):
+        some = [(_key(i), i) for i in instances[start : start + _READ]]
+        fresh = [i.id for key, i in some if key not in known]
+        points = store.surfaces.points_of_each(fresh) if fresh else {}
+        yield from [known.get(key) or known.put(key, _surface(points.get(i.id), i)) for key, i in some]
 
 
-def _surface(store: Store, instance: Instance) -> InstanceSurface:
+def _key(i: Instance) -> tuple[int, bytes]:
+    return i.id, i.aabb.tobytes() + i.center.tobytes() + i.observations.to_bytes(8, "little")
+
+
+def _surface(measured: NDArray[np.float32] | None, instance: Instance) -> InstanceSurface:
     """Return the support points inside the box, as deriving the box left strays out; those just outside are moved to
     its side, so that a thing is never nearer than its box.
     """
-    points = store.surfaces.points(instance.id).astype(np.float64)
-    points = inside_box(points, instance) if len(points) else points
-    if len(points) == 0:
+    points = None if measured is None else inside_box(measured.astype(np.float64), instance)
+    if points is None or len(points) == 0:
         return InstanceSurface(None, instance)
     low, high = instance.aabb
     stray = STRAY * float(np.max(instance.box.size))

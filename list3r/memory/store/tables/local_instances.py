@@ -14,7 +14,7 @@ from list3r.memory.records import Feature, LocalInstance, MaskTrack, MotionTrack
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import dequantise, pack, quantise, raw_array, unpack
 from list3r.memory.store.rows.columns import Columns, joined, nested
-from list3r.memory.store.rows.table import Table
+from list3r.memory.store.rows.table import Table, batches
 from list3r.memory.store.tables.library import LibraryState
 
 
@@ -122,6 +122,7 @@ class Supports:
     """The table of surfaces of local instances. What writes is called inside `transaction()`."""
 
     def __init__(self, connection: Connection) -> None:
+        self._connection = connection
         order, columns = "chunk_id, local_id", Columns.of(LocalSupport, _SUPPORT)
         self._rows = Table(connection, "supports", columns, order)
         of_instances = "observations JOIN supports USING (chunk_id, local_id)"
@@ -141,6 +142,18 @@ class Supports:
     def of(self, instance_id: int) -> list[LocalSupport]:
         """Return the surfaces of all local instances of an instance (no alias)."""
         return self._observed.all("instance = ?", (int(instance_id),))
+
+    def of_each(self, ids: Sequence[int]) -> dict[int, list[LocalSupport]]:
+        """Return `of` for some instances, by id; nothing for those of which nothing was observed."""
+        query = "SELECT chunk_id, local_id, instance FROM observations WHERE instance IN ({})"
+        with self._connection.snapshot():
+            rows = [row for part, marks in batches(ids) for row in self._connection.rows(query.format(marks), part)]
+            owner = {(chunk_id, local_id): instance for chunk_id, local_id, instance in rows}
+            supports = self._observed.among("instance", sorted(set(owner.values())))
+        found: dict[int, list[LocalSupport]] = {}
+        for s in sorted(supports, key=lambda s: (s.chunk_id, s.local_id)):
+            found.setdefault(owner[s.chunk_id, s.local_id], []).append(s)
+        return found
 
 
 class LocalInstances:
