@@ -130,6 +130,8 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
         similar(reader, vector=asked[0], space=SPACE, k=10)
         row["similar_first_again_s"] = round(time.perf_counter() - started[0], 2)
         row["similar_first_again_cpu_s"] = round(time.process_time() - started[1], 2)
+        next_ones = [lambda v=v: similar(reader, vector=v, space=SPACE, k=10) for v in asked[1:41]]
+        row |= timed("similar_soon_after_opening", next_ones, warm=0)
     row |= cold(path, points)
     row["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, 1)
     return row

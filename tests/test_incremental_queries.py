@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Instance
 from list3r.memory.search import vectors
 from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.store.checksums import summed_tables, write_table
 from list3r.memory.store.store import Store
+from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.queries.match import Filters
 from list3r.queries.nearest import nearest
 from list3r.queries.similar import similar
@@ -188,3 +194,81 @@ def test_cells_are_kept_and_followed_by_what_changes(
     for spoiled in (b"", first[:-100], first[: len(first) // 2] + bytes([1, 2, 3]) + first[len(first) // 2 + 3 :]):
         kept.write_bytes(spoiled)
         assert answers() == brute(store, query, 9), "what is kept cannot change an answer"
+
+
+@pytest.fixture
+def opened_large(store: Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A memory that is read part by part and whose cells are kept, closed."""
+    monkeypatch.setattr(vectors, "_EXACT", 50)
+    monkeypatch.setattr(vectors, "_PROBED", 2)
+    monkeypatch.setattr(vectors, "_LOOKED_AT", 2)
+    monkeypatch.setattr(vectors, "_RANKED", 4)
+    monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
+    monkeypatch.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
+    monkeypatch.setenv("LIST3R_CACHE", str(tmp_path / "cache"))
+    similar(store, vector=np.ones(32), space=SPACE, k=1)
+    store.close()
+    return store.path
+
+
+def nearest_vector(path: Path, query: np.ndarray) -> int:
+    with Store.open(path) as store:
+        return similar(store, vector=query, space=SPACE, k=1, structure=True, state="any")[0].instance.id
+
+
+def test_a_memory_just_opened_reads_the_cells_that_are_asked_for(
+    opened_large: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: set[int] = set()
+    of = Embeddings.of
+
+    def noted(table: Embeddings, space: str, ids: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        read.update(ids)
+        return of(table, space, ids)
+
+    with Store.open(opened_large) as again:
+        rows = dict(zip(*again.embeddings.all(SPACE), strict=True))
+    monkeypatch.setattr(Embeddings, "of", noted)
+    for n in (3, 77, 201):
+        assert nearest_vector(opened_large, rows[n]) == n
+    assert 0 < len(read) < COUNT / 3
+
+
+@pytest.mark.parametrize("stored", ["another", "infinite", "shorter"])
+def test_a_vector_that_would_answer_is_checked_when_its_cell_is_read(opened_large: Path, stored: str) -> None:
+    with Store.open(opened_large) as again:
+        _, rows = again.embeddings.of(SPACE, [77])
+    vector = {"another": rows[0] + 1e-4, "infinite": rows[0] * np.inf, "shorter": rows[0, :-1]}[stored]
+    with contextlib.closing(sqlite3.connect(opened_large)) as database, database:
+        database.execute("UPDATE embeddings SET vector = ? WHERE instance = 77", (vector.astype("<f4").tobytes(),))
+        if stored != "another":
+            write_table(database, summed_tables()["embeddings"])
+    with pytest.raises(MemoryFileError):
+        nearest_vector(opened_large, rows[0])
+
+
+def test_checksums_that_leave_vectors_out_are_no_way_past_the_check(opened_large: Path) -> None:
+    with contextlib.closing(sqlite3.connect(opened_large)) as database, database:
+        database.execute("DELETE FROM sums WHERE name = 'embeddings' AND part = 4")
+    with pytest.raises(MemoryFileError, match="not as it was written"):
+        nearest_vector(opened_large, np.ones(32, np.float32))
+
+
+def test_answers_do_not_outlive_transactions_that_were_taken_back(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vectors, "_EXACT", 50)
+    monkeypatch.setattr(vectors, "_PROBED", 1000)
+    query = np.random.default_rng(6).normal(size=32).astype(np.float32)
+
+    def best() -> int:
+        return similar(store, vector=query, space=SPACE, k=1, structure=True, state="any")[0].instance.id
+
+    wanted = brute(store, query, 1)
+    for n in (9, 10):
+        with pytest.raises(RuntimeError, match="no"), store.transaction():
+            store.embeddings.put(SPACE, [n], query[None])
+            assert best() == n
+            raise RuntimeError("no")
+        assert [best()] == wanted
+    store.close()

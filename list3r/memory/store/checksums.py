@@ -277,28 +277,27 @@ def bad_rows_of(database: sqlite3.Connection, table: SummedTable, parts: range |
     sums, broken = stored_sums(database, table, parts)
     for part in broken:
         yield BadRow("sums", (table.name, part), "the checksums of these rows are damaged")
-    keys = [table.summed.index(column) for column in table.key]
-    for part, rows in groupby(_rows_of(database, table, parts), key=lambda row: row[-1]):
-        found = [(tuple(row[k] for k in keys), row_crc(row[:-1])) for row in rows]
-        if part not in broken:
-            yield from compare(table.name, found, sums.pop(part, []))
+    for part, group in groupby(_rows_of(database, table, parts), key=lambda row: row[-1]):
+        rows = list(group)
+        found, written = [row_crc(row[:-1]) for row in rows], sums.pop(part, [])
+        if found != written and part not in broken:
+            yield from _differing(table, rows, found, written)
     for crcs in sums.values():
         yield BadRow(table.name, None, _missing(len(crcs)))
 
 
-def compare(table: str, found: list[tuple[Row, bytes]], written: list[bytes]) -> Iterator[BadRow]:
-    """Rows of one part, (key, CRC-32), against the sums that were written of them."""
-    if [crc for _, crc in found] == written:
-        return
+def _differing(table: SummedTable, rows: list[Row], found: list[bytes], written: list[bytes]) -> Iterator[BadRow]:
+    """Rows of one part whose sums are not among those that were written of them."""
+    keys = [table.summed.index(column) for column in table.key]
     left = Counter(written)
-    for key, crc in found:
+    for row, crc in zip(rows, found, strict=True):
         if left[crc] > 0:
             left[crc] -= 1
         else:
-            yield BadRow(table, key, "the row is not as it was written; it is damaged")
-    missing = len(written) - len(found)
+            yield BadRow(table.name, tuple(row[k] for k in keys), "the row is not as it was written; it is damaged")
+    missing = len(written) - len(rows)
     if missing > 0:
-        yield BadRow(table, None, _missing(missing))
+        yield BadRow(table.name, None, _missing(missing))
 
 
 def _missing(count: int) -> str:
