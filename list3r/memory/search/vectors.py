@@ -1,21 +1,18 @@
-"""A FAISS index over the embeddings of a store: derived when first asked for, kept with the store, never stored."""
+"""An index over the embeddings of a store: derived when first asked for, kept with the store, never stored."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
+from list3r.memory.search.all_vectors import AllVectors
 from list3r.memory.search.inverted_file import InvertedFile, unit
 from list3r.memory.search.vector_cells import Cells, cache_file, cell_count, sample_size
 from list3r.memory.store.store import Store
-
-if TYPE_CHECKING:
-    import faiss
 
 _EXACT = 30_000
 """Up to this many vectors all are compared; more are looked up in an inverted file."""
@@ -52,7 +49,7 @@ class VectorIndex:
     dimension: int
     count: int
     """Vectors in `index`."""
-    index: faiss.Index | InvertedFile
+    index: AllVectors | InvertedFile
     _made_of: int
     """State of the file as other processes left it."""
     _seen: int
@@ -112,7 +109,7 @@ class VectorIndex:
 
     def _ranked(self, store: Store, query: NDArray[np.float32], width: int, probed: int) -> list[tuple[int, float]]:
         """Return the best `width` or so of the index and all that has changed, by exact cosine."""
-        score, at = _ask(self.index, store, query, min(width, self.count), probed)
+        score, at = self.index.search(store, query, min(width, self.count), probed)
         found = [(int(n), float(s)) for n, s in zip(at, score, strict=True) if n >= 0 and int(n) not in self._stale]
         if self.count > _EXACT:
             ids, vectors = store.embeddings.of(self.space, [n for n, _ in found])
@@ -177,27 +174,18 @@ def _chosen_space(store: Store, space: str | None) -> str:
 
 def _build(store: Store, space: str, stamp: tuple[int, int, int]) -> VectorIndex:
     """Read what has to be read now, a batch at a time."""
-    import faiss
-
     count = store.embeddings.count(space)
-    index, total = _flat(store, space) if count <= _EXACT else _inverted(store, space, count)
-    if index is None:
-        index = faiss.IndexIDMap(faiss.IndexFlatIP(1))
-    return VectorIndex(space, int(index.d), total, index, stamp[0], len(store.embeddings.touched), stamp)
+    index, total = _all(store, space) if count <= _EXACT else _inverted(store, space, count)
+    return VectorIndex(space, index.d, total, index, stamp[0], len(store.embeddings.touched), stamp)
 
 
-def _flat(store: Store, space: str) -> tuple[Any, int]:
-    """Return all vectors as they are, and how many; no index where there are none."""
-    import faiss
-
-    index: Any = None
-    total = 0
-    for ids, vectors in store.embeddings.batches(space):
-        if index is None:
-            index = faiss.IndexIDMap(faiss.IndexFlatIP(vectors.shape[1]))
-        index.add_with_ids(unit(vectors), ids)
-        total += len(ids)
-    return index, total
+def _all(store: Store, space: str) -> tuple[AllVectors, int]:
+    """Return all vectors as they are, and how many."""
+    parts = [(ids, unit(vectors)) for ids, vectors in store.embeddings.batches(space)]
+    if not parts:
+        return AllVectors(np.zeros(0, np.int64), np.zeros((0, 1), np.float32)), 0
+    ids, vectors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return AllVectors(ids, vectors), len(ids)
 
 
 def _inverted(store: Store, space: str, count: int) -> tuple[InvertedFile, int]:
@@ -233,14 +221,3 @@ def _filled(store: Store, space: str, cells: Cells, seals: Mapping[int, bytes] |
         index.add(ids, rows, cells.of(index.quantizer, ids, rows))
         total += len(ids)
     return index, total
-
-
-def _ask(
-    index: faiss.Index | InvertedFile, store: Store, query: NDArray[np.float32], width: int, probed: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    if width == 0:
-        return np.zeros(0, np.float32), np.zeros(0, np.int64)
-    if isinstance(index, InvertedFile):
-        return index.search(store, query, width, probed)
-    score, at = index.search(query[None], width)
-    return score[0], at[0]
