@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Unpack
 
 import numpy as np
@@ -57,10 +58,11 @@ def within(
         if reach is None:
             inside = np.all((points >= low) & (points <= high), axis=1)
         else:
-            inside = np.linalg.norm(points - middle, axis=1) <= reach
-        share = float(inside.mean())
+            offset = points - middle
+            inside = np.einsum("ij,ij->i", offset, offset) <= reach * reach
+        share = np.count_nonzero(inside) / len(inside)
         if share > 0.0:
-            away = float(np.linalg.norm(i.center - middle))
+            away = math.dist(i.center, middle)
             reason = f"{'less than 1%' if share < 0.01 else f'{share:.0%}'} of its surface is inside"
             found.append(Match(i, round(share, 4), distance_to_point(store, i, middle), away, reason))
     return sorted(found, key=lambda m: (-m.score, m.center_distance_m or 0.0, m.instance.id))

@@ -350,8 +350,10 @@ class Connection:
         """Whether the rows of a table are checked as they are read, and not all when the first of them is."""
         return self._checks.by_part(table)
 
-    def believed(self, table: str, rows: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole."""
+    def believed(self, table: str, rows: list[tuple[Any, ...]], *, keep: bool = True) -> list[tuple[Any, ...]]:
+        """Whole rows of a table, the id first, as they are: checked one by one where the table is not as a whole, and
+        then known to `rows_unchecked` where that is to be kept.
+        """
         if self._checks.by_part(table):
             sound, written = self._checks.sound_parts(table), self._written(table)
             asked = [row for row in rows if (part := int(row[0]) >> PART_BITS) not in sound and part not in written]
@@ -360,7 +362,8 @@ class Connection:
             except FAILURES as error:
                 raise MemoryFileError(explained(self.path, error)) from error
             self.refuse(f"{table} {bad[0]}: the row is not as it was written" if bad else None)
-            self._checks.keep_sound(table, (row[0] for row in asked))
+            if keep:
+                self._checks.keep_sound(table, (row[0] for row in asked))
         return rows
 
     def _written(self, table: str) -> frozenset[int]:

@@ -74,7 +74,7 @@ class SurfaceCache(LruCache[tuple[int, bytes], InstanceSurface]):
 
 def surface_of(store: Store, instance: Instance) -> InstanceSurface:
     """Return the surface of an instance: its support, or its box where it has none."""
-    return next(surfaces_of(store, [instance]))
+    return store.derived.of(SurfaceCache).get(_key(instance)) or next(surfaces_of(store, [instance]))
 
 
 def surfaces_of(store: Store, instances: Sequence[Instance]) -> Iterator[InstanceSurface]:

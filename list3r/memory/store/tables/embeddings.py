@@ -51,7 +51,8 @@ class Embeddings:
         rows: list[tuple[Any, ...]] = []
         for part, marks in batches(ids):
             query = f"SELECT instance, space, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
-            rows += self._connection.believed("embeddings", self._connection.rows(query, (*part, space)))
+            found = self._connection.rows(query, (*part, space))
+            rows += self._connection.believed("embeddings", found, keep=False)
         return _vectors([(instance, vector) for instance, _, vector in sorted(rows)], space)
 
     def seals(self) -> dict[int, bytes]:
