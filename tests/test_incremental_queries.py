@@ -13,6 +13,7 @@ import pytest
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import OrientedBox
+from list3r.memory.maintenance.temporary_views import store_shown
 from list3r.memory.records import Instance
 from list3r.memory.search import vectors
 from list3r.memory.search.vectors import VectorIndex
@@ -254,10 +255,11 @@ def test_checksums_that_leave_vectors_out_are_no_way_past_the_check(opened_large
         nearest_vector(opened_large, np.ones(32, np.float32))
 
 
+@pytest.mark.parametrize("exact", [100_000, 50])
 def test_answers_do_not_outlive_transactions_that_were_taken_back(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: Store, exact: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(vectors, "_EXACT", 50)
+    monkeypatch.setattr(vectors, "_EXACT", exact)
     monkeypatch.setattr(vectors, "_PROBED", 1000)
     query = np.random.default_rng(6).normal(size=32).astype(np.float32)
 
@@ -272,3 +274,12 @@ def test_answers_do_not_outlive_transactions_that_were_taken_back(
             raise RuntimeError("no")
         assert [best()] == wanted
     store.close()
+
+
+def test_a_vector_of_a_memory_shown_otherwise_is_checked_too(opened_large: Path) -> None:
+    with contextlib.closing(sqlite3.connect(opened_large)) as database, database:
+        database.execute("UPDATE embeddings SET vector = zeroblob(128) WHERE instance = 77")
+    with store_shown(opened_large, lambda shown: None) as shown:
+        assert shown.embeddings.of(SPACE, [3])[0].tolist() == [3] and shown.embeddings.seals() == {}
+        with pytest.raises(MemoryFileError, match="embeddings 77"):
+            shown.embeddings.of(SPACE, [77])

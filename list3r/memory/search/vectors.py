@@ -50,8 +50,8 @@ class VectorIndex:
     count: int
     """Vectors in `index`."""
     index: AllVectors | InvertedFile
-    _made_of: int
-    """State of the file as other processes left it."""
+    _made_of: tuple[int, int]
+    """State of the file as other processes left it, and how often something was taken back."""
     _seen: int
     """How many of the store's own changes `index` holds."""
     _stamp: object = None
@@ -71,7 +71,7 @@ class VectorIndex:
         stamp = store.connection.stamp()
         held = store.derived.of(VectorIndices).of_space
         found = held.get(chosen)
-        if found is None or found._made_of != stamp[0] or not found._caught_up(store, stamp):
+        if found is None or found._made_of != (stamp[0], stamp[2]) or not found._caught_up(store, stamp):
             held.pop(chosen, None)
             found = held[chosen] = _build(store, chosen, stamp)
         return found
@@ -176,7 +176,7 @@ def _build(store: Store, space: str, stamp: tuple[int, int, int]) -> VectorIndex
     """Read what has to be read now, a batch at a time."""
     count = store.embeddings.count(space)
     index, total = _all(store, space) if count <= _EXACT else _inverted(store, space, count)
-    return VectorIndex(space, index.d, total, index, stamp[0], len(store.embeddings.touched), stamp)
+    return VectorIndex(space, index.d, total, index, (stamp[0], stamp[2]), len(store.embeddings.touched), stamp)
 
 
 def _all(store: Store, space: str) -> tuple[AllVectors, int]:
