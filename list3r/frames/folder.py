@@ -166,7 +166,7 @@ class FolderSource(Reader):
         gray = read_gray(mask, 1)
         height, width = gray.shape
         if abs(width * size[0] - height * size[1]) > 0.02 * height * size[1]:
-            raise FrameError(f"{mask.name} is {width}x{height}, of another shape than its picture")
+            raise FrameError(f"{mask.name} is {width}x{height}, unlike its picture")
         return np.asarray(cv2.resize(gray, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT) > 0)
 
     def _color(self, file: FrameFile) -> NDArray[np.uint8]:
@@ -259,7 +259,7 @@ class FolderSource(Reader):
             return ()
         size = f"{camera.width}x{camera.height}"
         where = f"({camera.cx:.0f}, {camera.cy:.0f})"
-        return (f"the camera's centre {where} lies far from the middle of {size}: is it of pictures of another size?",)
+        return (f"the camera's centre {where} lies far from the middle of {size}: is it for pictures of another size?",)
 
     def _turns(self) -> int | None:
         """Return how the pictures are turned in the world whose z is said to point up, None where it does not."""
@@ -369,12 +369,12 @@ class FolderSource(Reader):
 
 def without_pose(count: int, total: int) -> str:
     """That some frames have no pose, for people."""
-    return f"{count} of {total} frames come without a pose"
+    return f"{count} of {total} frames have no pose"
 
 
 def without_depth(count: int, total: int) -> str:
     """That some frames have no depth image, for people."""
-    return f"{count} of {total} frames come without a depth image and cannot be used"
+    return f"{count} of {total} frames have no depth image and cannot be used"
 
 
 def centred_camera(focal: float, rig: Rig) -> Camera:

@@ -111,7 +111,7 @@ class StreamFeed:
                 return f"the connection was lost ({reason}) and did not come back within {s.retry_s:g} s"
             if came_s is not None or reason != shown:
                 shown = reason
-                self._tell(f"no connection to {self._camera.name} ({reason}); it is tried again")
+                self._tell(f"no connection to {self._camera.name} ({reason}); trying again")
             with self._lock:
                 self._gap = True
                 self._state = replace(self._state, reconnects=self._state.reconnects + (came_s is not None))
