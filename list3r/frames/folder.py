@@ -50,7 +50,7 @@ _MOST_OFF_CENTRE = 0.2
 NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `confidence` belong to this recording?"
 
 
-NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not taken over"
+NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not used"
 
 
 class FolderSource(Reader):
@@ -324,7 +324,7 @@ class FolderSource(Reader):
         if self._bits < 16:
             notes = (
                 *notes,
-                f"the pictures use {self._bits} of their 16 bits, which are taken as the full range of brightness",
+                f"the pictures use {self._bits} of their 16 bits; these are taken as the full range of brightness",
             )
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration

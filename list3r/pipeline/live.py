@@ -209,7 +209,7 @@ def _await(feed: Feed, count: int, how: LiveSettings, interrupted: threading.Eve
         if state.ended or interrupted.is_set():
             if state.count:
                 return
-            raise SourceError(f"no picture came from {without_secrets(str(source))}: {state.reason or 'it was ended'}")
+            raise SourceError(f"no picture came from {without_secrets(str(source))}: {state.reason or 'stopped here'}")
         time.sleep(how.poll_s)
 
 

@@ -84,7 +84,7 @@ class StreamFeed:
         self._thread.join(2 * self._settings.silence_s)
 
     def _run(self) -> None:
-        reason = "it was ended"
+        reason = "stopped here"
         try:
             reason = self._follow()
         except SourceError as error:
@@ -117,7 +117,7 @@ class StreamFeed:
                 self._state = replace(self._state, reconnects=self._state.reconnects + (came_s is not None))
             self._stop.wait(pause_s)
             pause_s = min(2 * pause_s, s.most_pause_s)
-        return "it was ended"
+        return "stopped here"
 
     def _receive(self) -> tuple[float | None, bool, str]:
         """Keep the pictures of one connection: when the last one came, whether the source is over, how it ended."""
