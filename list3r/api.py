@@ -398,7 +398,7 @@ class SceneMemory(MemoryEdits):
 
         posed = position is not None and quat_wxyz is not None
         if (frame is not None) + (time_s is not None) + posed != 1 or (position is None) != (quat_wxyz is None):
-            raise OptionError("give one of frame, time, or position with quaternion to name a camera")
+            raise OptionError("name one camera: by frame, by time, or by position and quaternion")
         if frame is not None:
             return camera_of_frame(self.store, frame, session)
         if time_s is not None:

@@ -147,7 +147,7 @@ CASES = {
     "instances of no scene": ("instances {p}/blank.json {p}/room.l3r", "blank.json has no list of instances"),
     "ids in no folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/absent", "absent is not a folder"),
     "ids without masks": ("instances {p}/truth/truth.json {p}/room.json --ids {p}/folder", "no masks"),
-    "ids in an empty folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/folder", "holds no .png"),
+    "ids in an empty folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/folder", "no pictures of true"),
     "ids of every zeroth frame": ("instances {p}/truth/truth.json {p}/room.l3r --every 0", "--every 0"),
     "instances of another time": ("instances {p}/truth/truth.json {p}/room.l3r --align {p}/late.txt", "0 poses within"),
     "revisits of nothing": ("revisits {p}/absent.npz {p}/walk.l3r", "absent.npz"),

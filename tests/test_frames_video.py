@@ -101,7 +101,7 @@ def test_a_turned_video_is_put_upright(tmp_path: Path) -> None:
     assert frame.color[20, 50].mean() > 200 and frame.color[20, 10].mean() < 100
     assert any("turned" in note for note in source.info.notes)
     assert open_source(path, SourceOptions(intrinsics=(80.0, 80.0, 31.5, 47.5))).info.camera is not None
-    with pytest.raises(OptionError, match=r"the middle of pictures of 96x64, and these are 64x96"):
+    with pytest.raises(OptionError, match=r"the middle of pictures of 96x64, but these are 64x96"):
         open_source(path, SourceOptions(intrinsics=(80.0, 80.0, 47.5, 31.5)))
 
 

@@ -64,7 +64,7 @@ def test_the_order_and_every_file_shape_the_fingerprint(files: list[Path]) -> No
 
 
 def test_what_is_not_one_recording_is_refused(files: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="not one recording"):
+    with pytest.raises(SourceError, match="give files of one recording"):
         opened([files[0], write(tmp_path / "wide.mp4", 0, 3, (96, 48))])
     with pytest.raises(SourceError, match="not a video file"):
         opened([files[0], tmp_path])

@@ -106,7 +106,7 @@ def test_weights_come_back_and_damage_is_said(tmp_path: Path) -> None:
     for name, word in (("none", "missing"), ("old", "version 0"), ("hit", "damaged"), ("cut", "cannot be read")):
         with pytest.raises(OptionError, match=word) as said:
             load_weights(tmp_path / f"{name}.npz")
-        assert "\n" not in str(said.value) and "write it again" in str(said.value)
+        assert "\n" not in str(said.value) and "make it again" in str(said.value)
 
 
 def test_shipped_weights_are_small_and_whole() -> None:

@@ -271,7 +271,7 @@ def test_gated_weights_say_so(hub: type[_Hub]) -> None:
 
 def test_a_repository_without_weights_says_so(hub: type[_Hub]) -> None:
     hub.files = {"config.json": b"{}"}
-    with pytest.raises(OptionError, match="no weights in a form that is read here"):
+    with pytest.raises(OptionError, match="no weights of a known form"):
         fetch(Weights("a/b", APACHE))
 
 

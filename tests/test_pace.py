@@ -116,7 +116,7 @@ def test_a_build_says_it_and_goes_on_as_it_began(
     [
         (["--depth-every", "0"], "--depth-every 0: choose 1 to 8"),
         (["--depth-every", "9"], "--depth-every 9: choose 1 to 8"),
-        (["--depth-every", "2", "--reconstruction", "precomputed"], "--depth-every is of sfm and rgbd"),
+        (["--depth-every", "2", "--reconstruction", "precomputed"], "--depth-every works with sfm and rgbd"),
     ],
 )
 def test_a_step_that_makes_no_sense_is_refused(

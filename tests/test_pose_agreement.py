@@ -92,7 +92,7 @@ def test_a_world_with_y_up_is_not_taken_for_one_with_z_up(tmp_path: Path, monkey
 def test_a_camera_of_another_size_is_refused_and_the_fitting_one_named(tmp_path: Path) -> None:
     open_source(recordings.write_nerfstudio(tmp_path / "a"))
     half = recordings.write_nerfstudio(tmp_path / "b", fl_x=70.0, fl_y=70.0, cx=39.5, cy=29.5)
-    with pytest.raises(OptionError, match=r"80x60; --intrinsics 140,140,79.5,59.5"):
+    with pytest.raises(OptionError, match=r"80x60; .* --intrinsics 140,140,79.5,59.5"):
         open_source(half)
     assert open_source(half, SourceOptions(intrinsics=(70.0, 70.0, 39.5, 29.5))).info.camera is not None
 

@@ -167,7 +167,7 @@ def test_what_no_memory_has_is_refused(statement: str, writable: bool, make_memo
     path = make_memory()
     with sqlite3.connect(path) as database:
         database.execute(statement)
-    with pytest.raises(MemoryFileError, match=r"not opened|damaged or not ours"):
+    with pytest.raises(MemoryFileError, match=r"not opened|damaged or of another program"):
         Store.open(path, writable=writable)
 
 

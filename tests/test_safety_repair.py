@@ -135,7 +135,7 @@ def test_a_sound_memory_is_left_alone_or_copied(make_memory: Make, tmp_path: Pat
     assert (report.lost, report.rebuilt) == ({}, False)
     with Store.open(path) as a, Store.open(tmp_path / "copy.l3r") as b:
         assert scene_dict(a) == scene_dict(b)
-    with pytest.raises(MemoryFileError, match="exists already"):
+    with pytest.raises(MemoryFileError, match="already exists"):
         repair(path, tmp_path / "copy.l3r")
 
 

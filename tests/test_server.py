@@ -125,7 +125,7 @@ def test_lists_come_in_pages(room: Path) -> None:
     [
         ("describe", {"id": 99}, "has no instance 99"),
         ("picture", {"id": 2**70}, "has no instance"),
-        ("nearest", {}, "give one of id, point and words"),
+        ("nearest", {}, "give either id, point or words"),
         ("nearest", {"point": [1.0]}, "at least 3 items"),
         ("within", {"center": [0, 0, 0]}, "radius"),
         ("relations", {"predicate": "eats"}, "eats"),

@@ -132,11 +132,11 @@ def test_tokens_that_do_not_hold_are_refused(service: Service) -> None:
         ("/v1/memories/one/nearest", 400, "a point or an instance"),
         ("/v1/memories/one/nearest?x=1", 400, "three"),
         ("/v1/memories/one/nearest?x=1&y=2&z=inf", 422, "z"),
-        ("/v1/find?text=small+mug", 400, "ask the memory's file"),
+        ("/v1/find?text=small+mug", 400, "ask the memory file"),
         ("/v1/find?text=" + "mug+" * 400, 422, "500 characters"),
         ("/v1/find?text=mug&limit=100000", 422, "limit"),
         ("/v1/find?text=mug&offset=-1", 422, "offset"),
-        ("/v1/relations?predicate=left_of&memory=one", 400, "not one that is stored"),
+        ("/v1/relations?predicate=left_of&memory=one", 400, "is not stored"),
     ],
 )
 def test_what_makes_no_sense_is_explained(service: Service, path: str, status: int, said: str) -> None:

@@ -146,7 +146,7 @@ def test_a_mask_of_another_shape_hides_nothing_without_a_word(tmp_path: Path) ->
     put(root / "transforms.json", json.dumps(table))
     put(root / "mask.png", png(np.full((HEIGHT, HEIGHT), 255, np.uint8)))
     bad = list(open_source(root).read(0, COUNT))
-    assert all(not isinstance(frame, Frame) and "another shape" in frame.reason for frame in bad)
+    assert all(not isinstance(frame, Frame) and "unlike its picture" in frame.reason for frame in bad)
 
 
 def test_poses_in_splits_are_not_lost_without_a_word(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_poses_in_splits_are_not_lost_without_a_word(tmp_path: Path) -> None:
     ("missing", "told"),
     [
         ("odometry.csv", "there is no odometry.csv"),
-        ("depth/000001.png", "1 of 4 frames come without a depth image"),
+        ("depth/000001.png", "1 of 4 frames have no depth image"),
         ("rgb.mp4", "without its rgb.mp4"),
         ("camera_matrix.csv", "camera_matrix.csv is missing"),
     ],
@@ -186,7 +186,7 @@ def test_frames_without_a_pose_or_a_picture_are_counted(tmp_path: Path) -> None:
     poses = [[0, 0, 0, 1, 0.1 * k, 0, 0] for k in range(COUNT)]
     poses[1] = [float("nan")] * 7
     source = open_source(recordings.write_record3d(tmp_path / "a", poses=poses))
-    assert f"1 of {COUNT} frames come without a pose" in notes(source)
+    assert f"1 of {COUNT} frames have no pose" in notes(source)
     none = open_source(recordings.write_record3d(tmp_path / "b", poses=[[float("nan")] * 7] * COUNT))
     assert not none.info.has_poses and "no frame states a pose" in notes(none)
     root = recordings.write_polycam(tmp_path / "c")
@@ -195,7 +195,7 @@ def test_frames_without_a_pose_or_a_picture_are_counted(tmp_path: Path) -> None:
         "*.json",
         lambda k, text: json.dumps(json.loads(text) | ({"t_00": float("nan")} if k == 2 else {})),
     )
-    assert f"1 of {COUNT} frames come without a pose" in notes(open_source(root))
+    assert f"1 of {COUNT} frames have no pose" in notes(open_source(root))
 
 
 def test_other_models_of_colmap_are_named(tmp_path: Path) -> None:

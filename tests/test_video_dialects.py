@@ -83,7 +83,7 @@ def test_pictures_out_of_order_in_an_avi_are_counted(tmp_path: Path) -> None:
 def test_files_put_together_have_one_clock(tmp_path: Path) -> None:
     halves = [encode(tmp_path / f"{n}.ts", [40 * k for k in range(8)], first=8 * n) for n in range(2)]
     (tmp_path / "both.ts").write_bytes(b"".join(half.read_bytes() for half in halves))
-    assert any("starts again" in note for note in open_source(tmp_path / "both.ts").info.notes)
+    assert any("restarts" in note for note in open_source(tmp_path / "both.ts").info.notes)
     np.testing.assert_allclose(check_all(tmp_path / "both.ts"), 0.04 * np.arange(COUNT), atol=0.05)
 
 

@@ -127,7 +127,7 @@ class Output:
             else:
                 self._move(file, name, replace)
         except FileExistsError:
-            raise MemoryFileError(f"{self.place(name)} exists already; move it away or name another --out") from None
+            raise MemoryFileError(f"{self.place(name)} already exists; move it away or name another --out") from None
         except OSError as error:
             raise MemoryFileError(f"{self.place(name)} cannot be written: {error.strerror or error}") from error
 

@@ -90,7 +90,7 @@ def _done(job: BatchJob) -> Outcome:
         work, before = folder / f"{task.key}.l3r", folder / "before.l3r"
         keys, adding = _published(job, output, before)
         if task.key in keys:
-            found = Outcome(task, "done", "was there already", sha256=file_hash(before), bytes=before.stat().st_size)
+            found = Outcome(task, "done", "already there", sha256=file_hash(before), bytes=before.stat().st_size)
             shutil.rmtree(folder)
             return found
         report = _worked(job, work, before if adding else None)

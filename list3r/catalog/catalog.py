@@ -89,7 +89,7 @@ class Catalog:
             output.prepare()
             if output.size(kept) is None:
                 if is_remote(str(path)):
-                    raise CatalogError(f"{path} is in a store already; add it from there, without --store")
+                    raise CatalogError(f"{path} is in a store already; leave out --store")
                 output.publish(Path(path), kept, replace=False)
             content = read_content(output.place(kept), content.entry.name)
         return self._backend.put(content)
@@ -132,7 +132,7 @@ class Catalog:
         """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
         k, filters = _count(k), filters or CatalogFilters()
         if (point is None) == (instance_id is None):
-            raise OptionError("give a point or an instance, one of the two")
+            raise OptionError("give either a point or an instance")
         at = checked_point(point, "point") if point is not None else self._known(memory, instance_id).box.center
         count, own = k + 8, instance_id
         while True:
@@ -211,15 +211,15 @@ class Catalog:
         """
         k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
         if (instance_id is None) == (vector is None):
-            raise OptionError("give an instance or a vector to compare with, one of the two")
+            raise OptionError("give either an instance or a vector to compare with")
         chosen = self._space(memory, space)
         if instance_id is not None:
             if memory is None:
-                raise OptionError("the number of an instance belongs to one memory; name that memory")
+                raise OptionError("an id belongs to one memory; name that memory")
             self._known(memory, instance_id)
             asked = self._backend.vector(memory, instance_id, chosen)
             if asked is None:
-                raise CatalogError(f"{memory} has no vector of #{instance_id} in {chosen}; `list3r embed` makes them")
+                raise CatalogError(f"{memory} has no vector for #{instance_id} in {chosen}; `list3r embed` makes one")
         else:
             asked = np.asarray(vector, np.float32)
             if asked.ndim != 1 or not np.isfinite(asked).all() or not np.linalg.norm(asked):
@@ -244,9 +244,9 @@ class Catalog:
             predicate in VIEWPOINT or predicate not in ALL_PREDICATES or predicate == "between"
         ):
             stored = ", ".join(p for p in ALL_PREDICATES if p not in VIEWPOINT and p != "between")
-            raise OptionError(f"predicate {predicate!r} is not one that is stored; choose one of: {stored}")
+            raise OptionError(f"predicate {predicate!r} is not stored; choose one of: {stored}")
         if subject is None and object is None and memory is None:
-            raise OptionError("a question to all memories needs words for the subject or the object, such as mug")
+            raise OptionError("over all memories, name the subject or the object by words, such as mug")
         ends = self._end(subject, memory), self._end(object, memory)
         rows = self._backend.related(memory, ends[0], predicate, ends[1], k)
         by_name = self._by_name(entries, [r[0] for r in rows])
@@ -281,7 +281,7 @@ class Catalog:
         if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):
             return Wanted(tuple(wanted_words(what)))
         if memory is None:
-            raise OptionError(f"the number of {what} belongs to one memory; name that memory, or give words")
+            raise OptionError(f"id {what} belongs to one memory; name that memory, or give words")
         number = int(what.removeprefix("#")) if isinstance(what, str) else what
         return Wanted(instance_id=self._known(memory, number).id)
 
@@ -388,12 +388,12 @@ def _wanted(phrase: Phrase) -> Wanted:
         ("between", any(c.other for c in phrase.where)),
     ):
         if beyond:
-            raise OptionError(f"{phrase.text!r}: a catalogue cannot tell {what!r}; ask the memory's file")
+            raise OptionError(f"{phrase.text!r}: a catalogue cannot answer {what!r}; ask the memory file")
     where = []
     for clause in phrase.where:
         stored = tuple(p for p in clause.predicates if p not in VIEWPOINT)
         if not stored:
-            raise OptionError(f"{phrase.text!r}: {clause.wording!r} depends on the viewpoint; ask the memory's file")
+            raise OptionError(f"{phrase.text!r}: {clause.wording!r} depends on the viewpoint; ask the memory file")
         where.append((stored, _wanted(clause.object)))
     if not phrase.words and not where:
         raise OptionError(f"{phrase.text!r} has no word to search for; name an object, a colour or a shape")
@@ -403,5 +403,5 @@ def _wanted(phrase: Phrase) -> Wanted:
 def _count(k: int) -> int:
     k = checked_count(k)
     if k > MOST_ANSWERS:
-        raise OptionError(f"k = {k}: a catalogue gives at most {MOST_ANSWERS} answers")
+        raise OptionError(f"k = {k}: a catalogue gives at most {MOST_ANSWERS} answers; ask for fewer")
     return k

@@ -33,7 +33,9 @@ def read_content(path: str, name: str | None = None) -> MemoryContent:
 def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryContent:
     log = local.with_name(f"{local.name}-wal")
     if log.exists() and log.stat().st_size:
-        raise CatalogError(f"{path} is being written; wait for it to end, or `list3r repair` folds its log in")
+        raise CatalogError(
+            f"{path} is being written; wait for that to end. If nothing writes it, `list3r repair {path}` completes it"
+        )
     name = printable(name or Path(path).stem)
     with Store.open(local) as store, store.snapshot():
         things = [_thing(name, i) for i in store.instances.all()]

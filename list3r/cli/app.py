@@ -216,6 +216,9 @@ class _Failures:
         path = context.command_path if context is not None else "list3r"
         if (name := message.removeprefix("No such command '").rstrip("'.")) in FORMATS:
             message = f"{name} is a format: list3r export MEMORY --to {name} --out PATH"
+        groups = {} if context is None else getattr(context.command, "commands", {})
+        if (group := next((g for g, c in groups.items() if name in getattr(c, "commands", {})), None)) is not None:
+            message = f"{name} belongs to {group}: list3r {group} {name}"
         return self.fail("OptionError", f"{message.rstrip('.')}; see `{path} --help`")
 
 

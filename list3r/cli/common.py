@@ -32,9 +32,9 @@ def parse_point(text: str, option: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise OptionError(f"{option} {text!r}: three numbers with commas are needed, such as 0.5,1.2,0.8") from None
+        raise OptionError(f"{option} {text!r}: give three numbers separated by commas, such as 0.5,1.2,0.8") from None
     if not all(math.isfinite(v) for v in (x, y, z)):
-        raise OptionError(f"{option} {text!r}: the numbers must be finite")
+        raise OptionError(f"{option} {text!r}: give finite numbers")
     return x, y, z
 
 

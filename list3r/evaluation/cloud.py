@@ -130,7 +130,7 @@ def _nearest(
 def _points(points: ArrayLike, name: str) -> Array:
     p = np.asarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != 3 or len(p) == 0:
-        raise OptionError(f"the {name} cloud has shape {p.shape}; want (N, 3) with at least one point")
+        raise OptionError(f"the {name} cloud has shape {p.shape}; expected (N, 3) with at least one point")
     if not np.isfinite(p).all():
         raise OptionError(f"the {name} cloud has points that are not finite; leave them out first")
     return p

@@ -54,7 +54,7 @@ class Covisibility:
         if self.share.shape != (count, count) or self.time_s.shape != (count,):
             raise OptionError(
                 f"covisibility of {count} frames with shares of shape {self.share.shape} and times of shape "
-                f"{self.time_s.shape}: want ({count}, {count}) and ({count},)"
+                f"{self.time_s.shape}: expected ({count}, {count}) and ({count},)"
             )
         if count and not (np.diff(self.frame) > 0).all():
             raise OptionError("covisibility: the frame numbers must ascend")
@@ -75,10 +75,10 @@ def covisibility(
     maps, poses = np.asarray(depth), np.asarray(T_world_cam, dtype=np.float64)
     if maps.ndim != 3 or maps.shape[1:] != (camera.height, camera.width) or min(maps.shape[1:]) < 2:
         raise OptionError(
-            f"depth maps of shape {maps.shape} for a camera of {camera.width}x{camera.height}: want (F, h, w)"
+            f"depth maps of shape {maps.shape} for a camera of {camera.width}x{camera.height}: expected (F, h, w)"
         )
     if poses.shape != (len(maps), 4, 4):
-        raise OptionError(f"{len(maps)} depth maps with poses of shape {poses.shape}: want ({len(maps)}, 4, 4)")
+        raise OptionError(f"{len(maps)} depth maps with poses of shape {poses.shape}: expected ({len(maps)}, 4, 4)")
     posed = np.isfinite(poses).all(axis=(1, 2))
     grids = [_surface_points(d, camera, chosen.points) for d in maps]
     known = posed & np.array([len(g) > 0 for g in grids], dtype=bool)
@@ -166,7 +166,7 @@ def read_covisibility(path: str | Path) -> Covisibility:
         with np.load(path, allow_pickle=False) as arrays:
             missing = [name for name in ("frame", "time_s", "share") if name not in arrays]
             if missing:
-                raise SourceError(f"{path} has no array {' or '.join(missing)}; want frame, time_s and share")
+                raise SourceError(f"{path} has no array {' or '.join(missing)}; expected frame, time_s and share")
             return Covisibility(
                 arrays["frame"].astype(np.int64),
                 arrays["time_s"].astype(np.float64),

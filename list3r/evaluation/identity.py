@@ -65,7 +65,7 @@ def _covered(labels: Labels, masks: Sequence[tuple[int, Mask]], least_iou: float
     found: dict[int, list[tuple[float, int]]] = {}
     for estimated, mask in masks:
         if mask.shape != labels.shape:
-            raise OptionError(f"masks of shape {mask.shape} for true ids of shape {labels.shape}; want one size")
+            raise OptionError(f"masks of shape {mask.shape} for true ids of shape {labels.shape}; expected one size")
         shared = np.bincount(labels[mask], minlength=len(areas))
         iou = shared / np.maximum(areas + mask.sum() - shared, 1)
         for k in np.flatnonzero(iou >= least_iou).tolist():

@@ -62,7 +62,7 @@ def read_cloud(path: str | Path) -> PointCloud:
         raise SourceError(f"{path} cannot be read as {ending}: {first_line(error)}") from error
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise SourceError(f"{path} holds an array of shape {points.shape}; want points (N, 3)")
+        raise SourceError(f"{path} holds an array of shape {points.shape}; expected points (N, 3)")
     good = np.isfinite(points).all(axis=1)
     if not good.any():
         raise SourceError(f"{path} holds no finite point")
@@ -93,7 +93,7 @@ def _read(path: Path, ending: str) -> tuple[Any, Any, str]:
 
 def _columns(table: NDArray[Any], path: Path) -> tuple[Any, None]:
     if table.ndim != 2 or table.shape[1] < 3:
-        raise SourceError(f"{path} holds an array of shape {table.shape}; want points (N, 3), one a row")
+        raise SourceError(f"{path} holds an array of shape {table.shape}; expected points (N, 3), one a row")
     return table[:, :3], None
 
 
@@ -127,7 +127,7 @@ def thinned(cloud: PointCloud, voxel_m: float, most: int | None = None) -> Point
     The mean hides no error larger than the cell, and makes two clouds of different density comparable.
     """
     if not voxel_m >= 0 or not np.isfinite(voxel_m):
-        raise OptionError(f"voxel {voxel_m} m: want 0 for none, or a length")
+        raise OptionError(f"voxel {voxel_m} m: give 0 for none, or a length")
     if most is not None and most < 1:
         raise OptionError(f"points {most}: at least 1 is needed")
     points, normals = cloud.points, cloud.normals

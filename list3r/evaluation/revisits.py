@@ -37,9 +37,9 @@ class RevisitTruthSettings:
 
     def __post_init__(self) -> None:
         if not 0 < self.different <= self.least <= 1:
-            raise OptionError(f"shares {self.least} and {self.different}: want 0 < different <= least <= 1")
+            raise OptionError(f"shares {self.least} and {self.different}: give 0 < different <= least <= 1")
         if not 0 < self.precision <= 1:
-            raise OptionError(f"precision {self.precision}: want a share above 0 and up to 1")
+            raise OptionError(f"precision {self.precision}: give a share above 0 and up to 1")
 
 
 @dataclass(frozen=True)

@@ -32,9 +32,11 @@ def read_scene(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise SourceError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
-        raise SourceError(f"{path} is not JSON ({error}); want a scene graph of `list3r export --to json`") from error
+        raise SourceError(
+            f"{path} is not valid JSON ({error}); give a scene graph of `list3r export --to json`"
+        ) from error
     if not isinstance(scene, dict) or not isinstance(scene.get("instances"), list):
-        raise SourceError(f"{path} has no list of instances; want a scene graph of `list3r export --to json`")
+        raise SourceError(f"{path} has no list of instances; give a scene graph of `list3r export --to json`")
     return scene
 
 
@@ -63,7 +65,7 @@ def alignment_of(truth: Trajectory, estimate: Trajectory, *, with_scale: bool, t
     """
     rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
     if len(rows) < 3:
-        raise OptionError(f"{len(rows)} poses within {tolerance_s} s of each other; both need one clock")
+        raise OptionError(f"{len(rows)} poses within {tolerance_s} s of each other; both must use one clock")
     goal, from_ = truth.at(rows_truth), estimate.at(rows)
     S = align(goal, from_, with_scale=with_scale)
     turned = S.rotation @ from_.T_world_cam[:, :3, :3]
@@ -162,5 +164,5 @@ def _box(entry: Mapping[str, Any]) -> OrientedBox:
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"instance {entry.get('id')} has no box with center, size and quat_wxyz") from error
     if center.shape != (3,) or size.shape != (3,) or rotation.shape != (3, 3):
-        raise SourceError(f"instance {entry.get('id')} has a box of wrong length; want 3 + 3 + 4 numbers")
+        raise SourceError(f"instance {entry.get('id')} has a box of wrong length; expected 3 + 3 + 4 numbers")
     return OrientedBox(center, size, rotation)

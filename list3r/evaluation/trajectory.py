@@ -32,7 +32,9 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         if self.T_world_cam.shape != (len(self.time_s), 4, 4):
-            raise OptionError(f"{len(self.time_s)} times with poses of shape {self.T_world_cam.shape}: want (F, 4, 4)")
+            raise OptionError(
+                f"{len(self.time_s)} times with poses of shape {self.T_world_cam.shape}: expected (F, 4, 4)"
+            )
 
     def positions(self) -> Array:
         """Return the camera centres in the world. Shape (F, 3)."""
@@ -66,7 +68,7 @@ class Delta:
     def __post_init__(self) -> None:
         whole = self.unit != "frames" or float(self.value).is_integer()
         if self.unit not in _DELTA_UNITS or not (np.isfinite(self.value) and self.value > 0) or not whole:
-            raise OptionError(f"delta {self.value:g} {self.unit}: want at least 1 frame, or metres or seconds above 0")
+            raise OptionError(f"delta {self.value:g} {self.unit}: give at least 1 frame, or metres or seconds above 0")
 
     @staticmethod
     def parse(text: str) -> Delta:
@@ -77,7 +79,7 @@ class Delta:
         except ValueError:
             value = float("nan")
         if found is None or not np.isfinite(value):
-            raise OptionError(f"delta {text!r}: want frames, metres or seconds, such as 10, 0.5m or 2s")
+            raise OptionError(f"delta {text!r}: give frames, metres or seconds, such as 10, 0.5m or 2s")
         return Delta(value, {"m": "m", "s": "s"}.get(found.group(2) or "f", "frames"))
 
     def __str__(self) -> str:
@@ -143,7 +145,7 @@ def read_tum(path: str | Path) -> Trajectory:
         if words:
             rows.append(_tum_row(words, f"{path} line {number}"))
     if not rows:
-        raise SourceError(f"{path} holds no poses; want lines of: time_s tx ty tz qx qy qz qw")
+        raise SourceError(f"{path} holds no poses; expected lines of: time_s tx ty tz qx qy qz qw")
     table = np.array(rows)
     table = table[np.argsort(table[:, 0], kind="stable")]
     poses = np.tile(np.eye(4), (len(table), 1, 1))
@@ -156,11 +158,11 @@ def _tum_row(words: list[str], where: str) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise SourceError(f"{where} is not a pose ({error}); want: time_s tx ty tz qx qy qz qw") from error
+        raise SourceError(f"{where} is not a pose ({error}); expected: time_s tx ty tz qx qy qz qw") from error
     if len(numbers) != 8 or not np.isfinite(numbers).all():
-        raise SourceError(f"{where} has {len(numbers)} numbers; want 8 finite ones: time_s tx ty tz qx qy qz qw")
+        raise SourceError(f"{where} has {len(numbers)} numbers; expected 8 finite ones: time_s tx ty tz qx qy qz qw")
     if not np.linalg.norm(numbers[4:]) > 1e-6:
-        raise SourceError(f"{where} has a quaternion of length zero; want qx qy qz qw of a rotation")
+        raise SourceError(f"{where} has a quaternion of length zero; expected qx qy qz qw of a rotation")
     return numbers
 
 

@@ -123,7 +123,11 @@ def missing_parts(*, depth: bool, camera: bool) -> list[str]:
     """Return what a source lacks of depth and the camera's intrinsics, and what then is done, one sentence each."""
     out = [] if depth else ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
     if not camera:
-        done = "give --intrinsics fx,fy,cx,cy" if depth else "build estimates them; --intrinsics fx,fy,cx,cy is surer"
+        done = (
+            "give --intrinsics fx,fy,cx,cy"
+            if depth
+            else "build estimates them; --intrinsics fx,fy,cx,cy is more accurate"
+        )
         out.append(f"the camera's intrinsics are unknown: {done}")
     return out
 

@@ -100,7 +100,7 @@ def _writer(layout: OutputLayout) -> MakeWriter:
 
 def _check(opened: FrameSource, how: OutputLayout, layout: str, target: Path) -> None:
     if target.exists():
-        raise ExportError(f"{target} exists; name another folder or remove it first")
+        raise ExportError(f"{target} already exists; name another folder or remove it first")
     if not target.parent.is_dir():
         raise ExportError(f"the folder {target.parent} does not exist; create it first")
     require_camera(opened.info)

@@ -50,7 +50,7 @@ _MOST_OFF_CENTRE = 0.2
 NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `confidence` belong to this recording?"
 
 
-NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not taken over"
+NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not used"
 
 
 class FolderSource(Reader):
@@ -166,7 +166,7 @@ class FolderSource(Reader):
         gray = read_gray(mask, 1)
         height, width = gray.shape
         if abs(width * size[0] - height * size[1]) > 0.02 * height * size[1]:
-            raise FrameError(f"{mask.name} is {width}x{height}, of another shape than its picture")
+            raise FrameError(f"{mask.name} is {width}x{height}, unlike its picture")
         return np.asarray(cv2.resize(gray, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT) > 0)
 
     def _color(self, file: FrameFile) -> NDArray[np.uint8]:
@@ -259,7 +259,7 @@ class FolderSource(Reader):
             return ()
         size = f"{camera.width}x{camera.height}"
         where = f"({camera.cx:.0f}, {camera.cy:.0f})"
-        return (f"the camera's centre {where} lies far from the middle of {size}: is it of pictures of another size?",)
+        return (f"the camera's centre {where} lies far from the middle of {size}: is it for pictures of another size?",)
 
     def _turns(self) -> int | None:
         """Return how the pictures are turned in the world whose z is said to point up, None where it does not."""
@@ -324,7 +324,7 @@ class FolderSource(Reader):
         if self._bits < 16:
             notes = (
                 *notes,
-                f"the pictures use {self._bits} of their 16 bits, which are taken as the full range of brightness",
+                f"the pictures use {self._bits} of their 16 bits; these are taken as the full range of brightness",
             )
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         separate = rig.registration
@@ -369,12 +369,12 @@ class FolderSource(Reader):
 
 def without_pose(count: int, total: int) -> str:
     """That some frames have no pose, for people."""
-    return f"{count} of {total} frames come without a pose"
+    return f"{count} of {total} frames have no pose"
 
 
 def without_depth(count: int, total: int) -> str:
     """That some frames have no depth image, for people."""
-    return f"{count} of {total} frames come without a depth image and cannot be used"
+    return f"{count} of {total} frames have no depth image and cannot be used"
 
 
 def centred_camera(focal: float, rig: Rig) -> Camera:

@@ -225,4 +225,4 @@ def read_json(path: Path) -> object:
         return parse_json(read_text(path))
     except ValueError as error:
         where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else str(error)
-        raise SourceError(f"{path} is not JSON that can be read ({where}); fix or remove it") from None
+        raise SourceError(f"{path} is not valid JSON ({where}); fix or remove it") from None

@@ -116,13 +116,13 @@ class SourceOptions:
         if unknown := sorted(set(self.topics_by_role()) - set(ROLES)):
             raise OptionError(f"topics of {', '.join(unknown)}: the roles are {', '.join(ROLES)}")
         if self.every < 1:
-            raise OptionError(f"every {self.every}: take every n-th frame with n of at least 1")
+            raise OptionError(f"every {self.every}: give 1 or more")
         if (self.start or 0) < 0 or (self.stop is not None and self.stop <= (self.start or 0)):
             raise OptionError(f"frames {self.start} to {self.stop}: start must be 0 or more and stop greater than it")
         for name in ("depth_scale", "fps", "max_depth_m"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
-                raise OptionError(f"{name.replace('_', ' ')} {value}: a positive number is needed")
+                raise OptionError(f"{name.replace('_', ' ')} {value}: give a positive number")
         _check_seconds(self.start_s, self.end_s)
         if self.max_side is not None and self.max_side != 0 and self.max_side < _LEAST_SIDE:
             raise OptionError(f"max side {self.max_side}: at least {_LEAST_SIDE} px, or 0 for pictures as they are")
@@ -154,7 +154,7 @@ def _check_seconds(start: float | None, end: float | None) -> None:
 def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intrinsics:
     """Four finite numbers with positive focal lengths, px. Raises `OptionError`."""
     if len(values) != 4 or not all(math.isfinite(v) for v in values) or values[0] <= 0 or values[1] <= 0:
-        raise OptionError(f"{name} {_show(values)}: four numbers fx,fy,cx,cy in px are needed, like 525,525,320,240")
+        raise OptionError(f"{name} {_show(values)}: give four numbers fx,fy,cx,cy in px, such as 525,525,320,240")
     return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))
 
 
@@ -164,7 +164,7 @@ _MOST_DISTORTION = 100.0
 def check_distortion(values: Sequence[float]) -> tuple[float, ...]:
     """OpenCV's k1, k2, p1, p2, k3, filled up with zeros; empty when all are zero. Raises `OptionError`."""
     if len(values) > 5 or not all(math.isfinite(v) for v in values):
-        raise OptionError(f"distortion {_show(values)}: up to five numbers k1,k2,p1,p2,k3 are needed")
+        raise OptionError(f"distortion {_show(values)}: give up to five numbers k1,k2,p1,p2,k3")
     if any(abs(v) > _MOST_DISTORTION for v in values):
         raise OptionError(f"distortion {_show(values)}: no lens has more than {_MOST_DISTORTION:g}")
     full = tuple(float(v) for v in values) + (0.0,) * (5 - len(values))
@@ -174,7 +174,7 @@ def check_distortion(values: Sequence[float]) -> tuple[float, ...]:
 def check_rigid(matrix: NDArray[np.float64], name: str = "transform") -> NDArray[np.float64]:
     """Return a rigid 4x4 matrix with its rotation made exact. Raises `OptionError` for anything else."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
-        raise OptionError(f"{name}: a 4x4 rigid matrix with last row 0,0,0,1 is needed")
+        raise OptionError(f"{name}: give a 4x4 rigid matrix with last row 0,0,0,1")
     u, scales, vt = np.linalg.svd(matrix[:3, :3])
     if np.abs(scales - 1.0).max() > 0.01 or np.linalg.det(matrix[:3, :3]) < 0:
         raise OptionError(f"{name}: the upper left 3x3 block is not a rotation")
@@ -227,7 +227,7 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
             matrix[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
     else:
         order = ",".join("q" + letter for letter in quaternion)
-        raise OptionError(f"{name} {text!r}: 16 numbers (4x4) or tx,ty,tz,{order} are needed, not {len(v)}")
+        raise OptionError(f"{name} {text!r}: give 16 numbers (4x4) or tx,ty,tz,{order}, not {len(v)}")
     return tuple(tuple(float(x) for x in row) for row in check_rigid(matrix, name))
 
 
@@ -235,7 +235,7 @@ def parse_topics(text: str) -> tuple[tuple[str, str], ...]:
     """`color=/a,depth=/b,pose=/c`, any of them. Raises `OptionError`."""
     pairs = [tuple(part.strip() for part in word.partition("=")[::2]) for word in text.split(",") if word.strip()]
     if not pairs or any(not role or not topic for role, topic in pairs):
-        raise OptionError(f"topics {text!r}: like color=/camera/color/image_raw,depth=/camera/depth/image_raw")
+        raise OptionError(f"topics {text!r}: write them as color=/camera/color/image_raw,depth=/camera/depth/image_raw")
     return tuple((role, topic) for role, topic in pairs)
 
 
@@ -247,7 +247,7 @@ def parse_range(text: str) -> tuple[int | None, int | None]:
     except ValueError:
         start, colon, stop = None, "", None
     if not colon or (start or 0) < 0 or (stop is not None and stop <= (start or 0)):
-        raise OptionError(f"frames {text!r}: start:stop with start below stop is needed, like 100:400")
+        raise OptionError(f"frames {text!r}: give start:stop with start below stop, such as 100:400")
     return start, stop
 
 

@@ -85,13 +85,13 @@ def open_source(path: str | Path, options: SourceOptions | None = None, listing:
         shown = without_secrets(str(path))
         raise SourceError(f"{shown} is live and has no frames of its own yet: `list3r build` follows it into a memory")
     if str(path) == "":
-        raise SourceError(f"the name of the source is empty; {_WANTED}")
+        raise SourceError("the name of the source is empty; give a video file or a folder")
     root = Path(path).expanduser()
     if options.more:
         return _open_joined([root, *(Path(p).expanduser() for p in options.more)], options)
     try:
         if not root.exists():
-            raise SourceError(f"{root} does not exist; {_WANTED}")
+            raise SourceError(f"{root} does not exist; check the path")
         if options.kind in ("auto", "rosbag") and os.access(root, os.R_OK) and rosbag.is_recording(root):
             return rosbag.BagSource(root, options, listing)
         if options.kind in ("auto", "lerobot") and lerobot.is_dataset(root):
@@ -105,7 +105,8 @@ def open_source(path: str | Path, options: SourceOptions | None = None, listing:
             raise OptionError(f"{name} LeRobot data sets, and {root} is none; leave it out")
         return _open_folder(root, options) if root.is_dir() else _open_file(root, options)
     except PermissionError as error:
-        raise SourceError(f"{error.filename or root} cannot be read; check its permissions") from None
+        found = root if not os.access(root, os.R_OK) else error.filename or root
+        raise SourceError(f"{found} cannot be read; check its permissions") from None
 
 
 def _open_joined(paths: list[Path], options: SourceOptions) -> FrameSource:
@@ -138,7 +139,7 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     if not os.access(root, os.R_OK | os.X_OK):
         raise SourceError(f"{root} cannot be read; check its permissions")
     if not any(root.iterdir()):
-        raise SourceError(f"{root} is an empty folder; {_WANTED}")
+        raise SourceError(f"{root} is an empty folder; give one with frames, or a video file")
     if options.kind == "video":
         raise SourceError(f"{root} is a folder, not a video; name the video file in it or leave out the kind")
     if options.kind in ("auto", "stray") and stray.is_recording(root):
@@ -148,7 +149,7 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     splits = [name for name in _SPLITS if (root / name).is_file()]
     if options.kind in ("auto", "nerfstudio") and splits and not (root / "transforms.json").is_file():
         raise SourceError(
-            f"{root} states its poses in {', '.join(splits)}; put their frames into one transforms.json, or say --kind "
+            f"{root} states its poses in {', '.join(splits)}; put their frames into one transforms.json, or use --kind "
             "images to take colour alone"
         )
     for kind, find in FOLDERS.items():
@@ -168,8 +169,8 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
     inside = next((p for p in folders if images.find(p, options)), None)
     if inside is not None and options.kind in ("auto", "images"):
         raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
-    problem = "no known layout" if options.kind == "auto" else f"not the {options.kind} layout"
-    raise SourceError(f"{root} has {problem}; {_WANTED}")
+    problem = "in no known layout" if options.kind == "auto" else f"not in the {options.kind} layout"
+    raise SourceError(f"{root} is {problem}; {_WANTED}")
 
 
 def _check_nothing_ignored(root: Path, kind: str, options: SourceOptions) -> None:
@@ -197,7 +198,7 @@ def _open_file(path: Path, options: SourceOptions) -> FrameSource:
     if path.suffix.lower() in IMAGE_ENDINGS:
         raise SourceError(f"{path} is one image; name the folder of images or a video")
     if path.is_file() and path.stat().st_size == 0:
-        raise SourceError(f"{path} is empty (0 bytes); is the upload complete?")
+        raise SourceError(f"{path} is empty (0 bytes); is the copy complete?")
     if not path.is_file():
         raise SourceError(f"{path} is not a regular file; {_WANTED}")
     if find is not None:
@@ -205,7 +206,7 @@ def _open_file(path: Path, options: SourceOptions) -> FrameSource:
     if options.kind == "auto" and stray.is_recording(path.parent) and path.name == "rgb.mp4":
         raise SourceError(
             f"{path} is the video of a Stray Scanner recording, whose depth and poses would be lost; give the folder "
-            f"{path.parent}, or say --kind video to take its colour alone"
+            f"{path.parent}, or use --kind video to take its colour alone"
         )
     from list3r.frames.readers.video import VideoSource
 

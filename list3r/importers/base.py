@@ -75,7 +75,7 @@ def read_json_file(path: Path) -> Any:
     except OSError as error:
         raise SourceError(f"{path} cannot be read ({error.strerror}); check the file") from None
     except ValueError as error:
-        raise SourceError(f"{path} is not JSON that can be read ({error}); is the copy complete?") from None
+        raise SourceError(f"{path} is not valid JSON ({error}); is the copy complete?") from None
 
 
 def box_surface(box: OrientedBox) -> NDArray[np.float32]:

@@ -40,7 +40,7 @@ def open_archive(file: Path | BinaryIO) -> zipfile.ZipFile:
     strange = next((m for m in archive.infolist() if m.compress_type not in _STEADY), None)
     if strange is not None:
         archive.close()
-        raise zipfile.BadZipFile(f"{strange.filename} is packed by another way than deflate; pack it again")
+        raise zipfile.BadZipFile(f"{strange.filename} is not packed with deflate; pack it again")
     return archive
 
 

@@ -133,7 +133,7 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
         why = NO_NETWORK
     except HfHubHTTPError as error:
         code = getattr(error.response, "status_code", "?")
-        why = f"the hub does not hand it out (status {code}); check the name and the revision"
+        why = f"the hub refuses it (status {code}); check the name and the revision"
     except Exception as error:  # what the hub's transport raises without a network is not a closed list
         if not _is_transport(error):
             raise
@@ -142,7 +142,7 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
         raise OptionError(f"{name}@{wanted} cannot be fetched: {why.format(name=name)}")
     cached = find_cached(name, wanted) or find_cached(name, folder.name)
     if cached is None:
-        raise OptionError(f"{name}@{wanted} has no weights in a form that is read here ({', '.join(SINGLE_FILES)})")
+        raise OptionError(f"{name}@{wanted} has no weights of a known form ({', '.join(SINGLE_FILES)})")
     return cached
 
 

@@ -37,7 +37,7 @@ def check_run(run: RunOptions) -> None:
     if run.engine not in ("local", "ray"):
         raise OptionError(f"--engine {run.engine} is not known; choose local or ray")
     if run.engine == "ray" and run.workers == 0:
-        raise OptionError("--workers 0 works in this process only; with --engine ray leave it out or give 1 or more")
+        raise OptionError("--workers 0 is for --engine local; with ray leave it out or give 1 or more")
     if run.engine != "ray" and run.address is not None:
         raise OptionError(f"--address {run.address} needs --engine ray")
     if run.resume and run.force:

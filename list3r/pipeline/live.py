@@ -127,13 +127,13 @@ def build_live(
     started, run, watch, memory = time.monotonic(), run or RunOptions(), watch or Watch(), Path(memory)
     options, how = options or SourceOptions(), live or LiveSettings()
     if options.more:
-        raise OptionError("a live source is a single one; only recordings can be several files")
+        raise OptionError("a live source is one source; only recordings can be several files")
     if run.engine != "local":
         raise OptionError("a live source is processed on this machine as it comes; leave out --engine")
     if run.resume:
         raise OptionError("a live source cannot be resumed; `list3r update` adds a later session")
     if not run.force and memory.is_file() and memory.stat().st_size:
-        raise MemoryFileError(f"{memory} exists already; --force replaces it")
+        raise MemoryFileError(f"{memory} already exists; --force replaces it")
     spool = memory.with_name(f"{memory.name}.frames")
     with _until_interrupted() as interrupted, _feed(str(source), spool, options, how, watch) as feed:
         first = replace(options, fps=None) if feed.folder == spool else options
@@ -209,7 +209,7 @@ def _await(feed: Feed, count: int, how: LiveSettings, interrupted: threading.Eve
         if state.ended or interrupted.is_set():
             if state.count:
                 return
-            raise SourceError(f"no picture came from {without_secrets(str(source))}: {state.reason or 'it was ended'}")
+            raise SourceError(f"no picture came from {without_secrets(str(source))}: {state.reason or 'stopped here'}")
         time.sleep(how.poll_s)
 
 

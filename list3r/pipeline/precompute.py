@@ -156,5 +156,5 @@ def _write(path: Path, made: Reconstruction, shown: dict[int, int]) -> None:
     except OSError as error:
         part.unlink(missing_ok=True)
         raise OptionError(
-            f"{path} cannot be written: {error.strerror or error}; finished files are kept: give the command again"
+            f"{path} cannot be written: {error.strerror or error}; finished files are kept: run the command again"
         ) from error

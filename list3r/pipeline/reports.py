@@ -183,7 +183,9 @@ def _build_notes(store: Store, session: int, lost: int, bad: int, components: in
     if bad:
         notes.append(f"{_count(bad, 'frame')} could not be used, skipped: {_listed(store)}")
     if lost and store.facts.poses == "given":
-        notes.append(f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs none")
+        notes.append(
+            f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs no poses"
+        )
     elif lost:
         where = _runs([f.frame_index for f in store.frames.all(session) if f.state == "lost"])
         notes.append(f"the camera could not be tracked in {_count(lost, 'frame')} ({where}); they have no pose")

@@ -363,13 +363,12 @@ def check_buildable(info: SourceInfo, settings: BuildSettings) -> None:
         raise OptionError(f"--depth-every {every}: choose 1 to {MOST_DEPTH_EVERY}; to take fewer frames use --every")
     if every is not None and every > 1 and not model.thins:
         raise OptionError(
-            f"--depth-every is of sfm and rgbd, not of {settings.reconstruction}; leave it out, or thin the frames "
-            "with --every"
+            f"--depth-every works with sfm and rgbd, not with {settings.reconstruction}; leave it out, or use --every"
         )
     if model.needs_depth and not info.has_depth:
         raise OptionError(
-            f"{info.path} has no depth, and {settings.reconstruction} reconstructs from RGB-D only; "
-            "give a folder in the 7-Scenes, TUM or Replica layout"
+            f"{info.path} has no depth, which {settings.reconstruction} needs; "
+            "leave out --reconstruction, or give a source with depth (docs/sources.md)"
         )
     if model.needs_camera and info.camera is None:
         raise OptionError(f"the intrinsics of {info.path} are unknown; give --intrinsics fx,fy,cx,cy")
@@ -396,7 +395,7 @@ def _check_prior(info: SourceInfo, reconstruction: str) -> None:
         )
     if not info.poses_metric:
         raise OptionError(
-            f"--poses prior holds the poses of {info.path} against depth in metres, and they have a unit of their own; "
+            f"--poses prior compares poses with depth in metres, but those of {info.path} have another unit; "
             f"{otherwise}"
         )
     if not entry(reconstruction).follows_prior:

@@ -82,7 +82,7 @@ def _replacing(path: Path, aside: Path) -> Target:
     with Store.open(path) as store:
         begun, ours = _holds_something(store), _is_marked(store, aside)
     if os.path.lexists(aside) and not ours:
-        raise MemoryFileError(f"{aside} is where --force would keep {path.name}; move it away")
+        raise MemoryFileError(f"{aside} is in the way: --force keeps {path.name} there while it builds; move it away")
     Store.open(path, writable=True).close()
     if ours and not begun:
         remove_memory(path)
@@ -132,8 +132,10 @@ def _check_same(store: Store, info: SourceInfo, settings: BuildSettings) -> None
     """Raise `OptionError` when a memory was begun from another source or with other settings."""
     for session in store.sessions.all():
         if session.fingerprint != info.fingerprint:
+            same = session.source in (info.path, str(Path(info.path).resolve()))
+            how = "with other frames or camera options" if same else f"not from {info.path}"
             raise OptionError(
-                f"{store.path} was begun from {session.source} with other frames or camera options; "
+                f"{store.path} was begun from {session.source}, {how}; "
                 "give the same source and options to --resume, or --force to start again"
             )
         different = session_settings(session).differing(settings)

@@ -178,9 +178,9 @@ def checked_point(value: ArrayLike, name: str) -> NDArray[np.float64]:
     except (TypeError, ValueError) as error:
         raise OptionError(f"{name} must be three numbers x, y, z, not {value!r}") from error
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise OptionError(f"{name} must be three finite numbers x, y, z, not {value!r}")
+        raise OptionError(f"{name} must be three finite numbers x, y, z, not {str(point.tolist())[:80]}")
     if np.abs(point).max() > _FARTHEST:
-        raise OptionError(f"{name} {value!r} is too far away; distances up to {_FARTHEST:g} can be computed")
+        raise OptionError(f"{name} {point.tolist()} is too far away; distances up to {_FARTHEST:g} can be computed")
     return point
 
 

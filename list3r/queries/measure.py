@@ -44,7 +44,9 @@ def measure(store: Store, a: int, b: int) -> InstanceDistance:
     """
     one, two = checked_instance(store, a), checked_instance(store, b)
     if one.component != two.component:
-        raise OptionError(f"{one.id} and {two.id} lie in components that are not placed against each other")
+        raise OptionError(
+            f"#{one.id} and #{two.id} lie in different connected components, so their distance is unknown"
+        )
     step = two.center - one.center
     sigmas = one.position_sigma_m, two.position_sigma_m
     sigma = None if None in sigmas else float(np.linalg.norm([s for s in sigmas if s is not None]))

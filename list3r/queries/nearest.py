@@ -57,7 +57,7 @@ def nearest(
     """
     k = checked_count(k)
     if point is not None and instance_id is not None:
-        raise OptionError("give a point or an instance to be near to, not both")
+        raise OptionError("give either a point or an instance to be near to")
     if point is None and instance_id is None and words is None:
         raise OptionError("give what to be near to: a point, an instance, or words")
     if max_distance is not None:

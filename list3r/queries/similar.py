@@ -37,11 +37,11 @@ def similar(
     """
     k = checked_count(k)
     if (instance_id is None) == (vector is None):
-        raise OptionError("give an instance or a vector to compare with, one of the two")
+        raise OptionError("give either an instance or a vector to compare with")
     if vector is not None and space is None:
         raise OptionError("a vector needs the name of its embedding space, model@revision/dim")
     if part is not None and (vector is None or np.shape(vector) != (part,)):
-        raise OptionError(f"a part of {part} numbers needs a vector of as many")
+        raise OptionError(f"part {part} needs a vector of {part} numbers")
     filters = Filters(**options)
     origin = None if instance_id is None else checked_instance(store, instance_id)
     index = VectorIndex.of(store, space)
@@ -72,7 +72,7 @@ def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: 
     ids, cosines = [], []
     for some, vectors in store.embeddings.batches(space):
         if vectors.shape[1] < part:
-            raise SpaceMismatchError(f"{part} numbers cannot be compared in the space {space}, which has fewer")
+            raise SpaceMismatchError(f"part {part}: the space {space} has fewer numbers")
         head = vectors[:, :part].astype(np.float64)
         ids.append(some)
         cosines.append(head @ query / np.maximum(np.linalg.norm(head, axis=1) * length, 1e-12))

@@ -84,7 +84,7 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         said = parse_json(read_file(path, _MAX_MANIFEST))
     except (ValueError, RecursionError) as error:
-        raise OptionError(f"{path} is not JSON ({first_line(error)}); see docs/precomputed.md") from None
+        raise OptionError(f"{path} is not valid JSON ({first_line(error)}); see docs/precomputed.md") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("version") != VERSION:
         raise OptionError(f'{path} must say "format": "{FORMAT}", "version": {VERSION}')
     if said.get("scale") not in ("metric", "relative"):

@@ -92,7 +92,7 @@ class ReadingTools:
         """
         given = [x for x in (id, point, words) if x is not None]
         if len(given) != 1:
-            raise OptionError("give one of id, point and words")
+            raise OptionError("give either id, point or words")
         found = self._memory.nearest(given[0], limit, max_distance=max_distance, label=label, color=color)
         return self._matches(found, found.notes)
 

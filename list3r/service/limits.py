@@ -101,7 +101,7 @@ class Guard:
             return
         most = self._limits.request_bytes
         if int(headers.get("content-length", "0") or 0) > most:
-            await answer.refuse(413, "SizeError", f"a request may have {most} bytes")
+            await answer.refuse(413, "SizeError", f"a request may have at most {most} bytes")
             return
         body = b""
         while True:
@@ -110,7 +110,7 @@ class Guard:
                 return
             body += message.get("body", b"")
             if len(body) > most:
-                await answer.refuse(413, "SizeError", f"a request may have {most} bytes")
+                await answer.refuse(413, "SizeError", f"a request may have at most {most} bytes")
                 return
             if not message.get("more_body", False):
                 break

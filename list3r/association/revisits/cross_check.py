@@ -78,7 +78,7 @@ class CrossCheck:
     def contradiction(self, settings: CrossSettings) -> str | None:
         """Return why the relation cannot be true, or None."""
         if self.overlap < settings.least_overlap:
-            return f"the chunks share no surface through it ({self.overlap:.0%} of their points)"
+            return f"by it the chunks share no surface ({self.overlap:.0%} of their points)"
         if self.agreement < settings.least_agreement:
             return f"{1 - self.agreement:.0%} of what is compared lies in space that the other chunk saw to be empty"
         if self.likeness < settings.least_likeness:

@@ -135,7 +135,7 @@ class _Verdict:
         shared = shared_view(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
         self.scores = {"shared_view": shared}
         if shared < self._least_shared:
-            return f"no two frames of the places see the same through it ({shared:.0%} of their surface at most)"
+            return f"by it no two frames of the places see the same ({shared:.0%} of their surface at most)"
         check = cross_check(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
         self.scores |= {"overlap": check.overlap, "agreement": check.agreement, "kinds": float(check.kinds)}
         if np.isfinite(check.likeness):

@@ -72,5 +72,5 @@ def _devices() -> list[str]:
 
         found = [str(n) for n in range(torch.cuda.device_count())]
     if not found:
-        raise OptionError("--gpus: this machine has no GPU that can be used")
+        raise OptionError("--gpus: this machine has no usable GPU; leave it out")
     return found

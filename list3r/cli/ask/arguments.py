@@ -112,7 +112,7 @@ class RegionArguments:
             parts = self.box.split(",")
             if len(parts) != 6:
                 raise OptionError(
-                    f"--box {self.box!r}: six numbers with commas are needed, the lower and the upper corner"
+                    f"--box {self.box!r}: give six numbers separated by commas, the lower and the upper corner"
                 )
             lower, upper = (parse_point(",".join(half), "--box") for half in (parts[:3], parts[3:]))
             return {"lower": lower, "upper": upper}
@@ -181,7 +181,5 @@ class SimilarArguments:
         try:
             x0, y0, x1, y1 = (float(part) for part in self.box.split(","))
         except ValueError:
-            raise OptionError(
-                f"--box {self.box!r}: four numbers x0,y0,x1,y1 are needed, such as 120,80,180,150"
-            ) from None
+            raise OptionError(f"--box {self.box!r}: give four numbers x0,y0,x1,y1, such as 120,80,180,150") from None
         return x0, y0, x1, y1

@@ -71,7 +71,7 @@ def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | Non
         raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
     if view is None and time is None and pose is None:
         if session is not None:
-            raise OptionError(f"--session {session} goes with a camera: --view FRAME, --time S or --pose; leave it out")
+            raise OptionError(f"--session {session} needs a camera: --view FRAME, --time S or --pose; or leave it out")
         return None
     if pose is None:
         return scene.camera(frame=view, time_s=time, session=session)
@@ -80,7 +80,7 @@ def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | Non
     except ValueError:
         values = []
     if len(values) != 7 or not all(math.isfinite(v) for v in values):
-        raise OptionError(f"--pose {pose!r}: seven finite numbers with commas are needed, x,y,z and w,x,y,z")
+        raise OptionError(f"--pose {pose!r}: give seven finite numbers separated by commas, x,y,z and w,x,y,z")
     return scene.camera(position=values[:3], quat_wxyz=values[3:], session=session)
 
 

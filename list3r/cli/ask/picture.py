@@ -32,7 +32,7 @@ def picture(
 
     out = out or Path(f"instance_{instance_id}.jpg")
     if out.suffix.lower() not in (".jpg", ".jpeg", ".png"):
-        raise OptionError(f"--out {out}: a picture is written to a .jpg or .png file")
+        raise OptionError(f"--out {out}: name a .jpg or .png file")
     with open_memory(memory) as scene:
         found = scene.picture(instance_id)
     with replacing(out) as temporary:

@@ -121,7 +121,7 @@ def batch(
                 _outcome_printer(json),
             )
     except KeyboardInterrupt:
-        note("", "interrupted; finished memories stay; give the same command again to continue")
+        note("", "interrupted; finished memories are kept: run the same command again to continue")
         raise typer.Exit(1) from None
     _print_report(report, json)
     if report.failed:

@@ -101,7 +101,7 @@ def _ask(url: str, name: str, memory: str | None, arguments: Arguments, json: bo
 
 def _one(memory: str | None) -> str:
     if memory is None:
-        raise _option_error(f"a place belongs to one memory; name that instead of {ALL}")
+        raise _option_error(f"a place belongs to one memory; name that memory instead of {ALL}")
     return memory
 
 
@@ -145,7 +145,7 @@ def _picture(catalog: Catalog, memory: str | None, arguments: Arguments) -> tupl
     path = next((e.path for e in entries if Path(e.path).is_file()), None)
     if path is None:
         raise _option_error(
-            "no memory file of the catalogue is on this machine to say which model describes the picture"
+            "--image needs the model of a memory, and no file of the catalogue is on this machine; ask where one is"
         )
     like = SimilarArguments(arguments["id"], arguments["image"], arguments["box"])
     with open_scene(path) as scene:

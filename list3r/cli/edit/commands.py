@@ -165,4 +165,4 @@ def _parse_parts(text: str) -> list[tuple[int, int]]:
         pairs = [part.split(":") for part in text.split(",")]
         return [(int(chunk), int(local)) for chunk, local in pairs]
     except ValueError:
-        raise OptionError(f"--out {text!r}: CHUNK:LOCAL pairs with commas are needed, such as 3:4,5:2") from None
+        raise OptionError(f"--out {text!r}: give CHUNK:LOCAL pairs separated by commas, such as 3:4,5:2") from None

@@ -61,7 +61,7 @@ def _ids(text: str) -> tuple[int, ...]:
     from list3r.memory.errors import OptionError
 
     if not all(word.strip().isdecimal() for word in text.split(",")):
-        raise OptionError(f"--ids {text}: numbers with commas are needed, such as 3,7,12")
+        raise OptionError(f"--ids {text}: give numbers separated by commas, such as 3,7,12")
     return tuple(map(int, text.split(",")))
 
 
@@ -125,10 +125,10 @@ def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
 
     form = find_format(to)
     if form.folder:
-        raise OptionError(f"{to} is a folder and cannot go to standard output; name a folder with --out")
+        raise OptionError(f"{to} writes a folder, which cannot go to standard output; name one with --out")
     with tempfile.TemporaryDirectory() as folder:
         first, *others = scene.export(to, Path(folder) / f"{scene.path.stem}{form.suffixes[0]}", **options)
         with first.open("rb") as file:
             shutil.copyfileobj(file, sys.stdout.buffer)
     for other in others:
-        note(f"note: {other.name} is not written to standard output; with a file in --out it is written beside it")
+        note(f"note: {other.name} is left out; --out FILE writes it beside the file")

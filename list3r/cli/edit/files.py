@@ -90,7 +90,7 @@ def repair(
     if not report.lost:
         say("nothing is lost")
     elif report.rebuilt:
-        say("instances and relations were derived again from what is left")
+        say("instances and relations were derived again from the rest")
 
 
 def doctor(json: JsonOption = False) -> None:

@@ -178,4 +178,4 @@ def _check_lengths(**lengths: float | None) -> None:
 
     for name, value in lengths.items():
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise OptionError(f"--{name} {value:g}: give a length above 0, metres")
+            raise OptionError(f"--{name} {value:g}: give a length above 0, in metres")

@@ -248,7 +248,7 @@ def mask_frames(store: Store, ids_folder: Path, every: int) -> Iterator[tuple[An
             found.setdefault(frame, {}).setdefault(instance_id, []).append((mask, track.image_size))
     pictures = sorted(ids_folder.glob("*.png"))
     if not pictures:
-        raise SourceError(f"{ids_folder} holds no .png of true ids; a simulated walk writes them with write_ids")
+        raise SourceError(f"{ids_folder} holds no pictures of true ids (.png)")
     for index in range(0, len(pictures), every):
         try:
             labels = read_raw_depth(pictures[index]).astype(np.int64)

@@ -108,7 +108,7 @@ def precompute(
     from list3r.pipeline.precompute import precompute as write
 
     def interrupted(begun: bool) -> str:
-        return f"interrupted; finished files in {out} are kept: give the command again"
+        return f"interrupted; finished files in {out} are kept: run the command again"
 
     how = replace(run, force=force)
     with watching("reconstructing", interrupted, quiet=json) as watch:

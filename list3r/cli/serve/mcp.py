@@ -42,7 +42,7 @@ def mcp(
     from list3r.memory.errors import OptionError
 
     if (memory is None) == (catalog is None):
-        raise OptionError("give a memory or --catalog URL, one of the two: list3r mcp house.l3r")
+        raise OptionError("give either a memory or --catalog URL, such as: list3r mcp house.l3r")
     if catalog is not None and write:
         raise OptionError("--write needs a memory; a catalogue cannot be edited")
     from list3r.server.app import HttpSettings, serve_http, serve_stdio

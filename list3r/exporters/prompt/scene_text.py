@@ -69,7 +69,7 @@ def scene_prompt(
     for line in writer.head():
         if not budget.add(line):
             needed = sum(_cost(x) for x in writer.head())
-            raise OptionError(f"{tokens} tokens are too few: the head of the text alone takes {needed}")
+            raise OptionError(f"{tokens} tokens are too few: the head of the text alone takes {needed}; allow more")
     listed = writer.rows(budget, ranked)
     if len(listed) < len(things):
         writer.counts(budget, [name_of(i) for i in listed] if question else [])

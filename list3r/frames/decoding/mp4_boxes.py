@@ -29,7 +29,7 @@ def check_index(path: Path) -> None:
             entries += claimed
             if entries > MOST_ENTRIES or number > _MOST_BOXES:
                 raise SourceError(
-                    f"{path}: its index claims over {MOST_ENTRIES:,} entries; it is damaged, or cut it into parts"
+                    f"{path}: its index claims over {MOST_ENTRIES:,} entries; it is damaged, or too long: cut it"
                 )
 
 

@@ -108,7 +108,7 @@ def list_timestamps(path: Path) -> VideoTimestamps:
     except av.FFmpegError as error:
         headless = isinstance(error, av.InvalidDataError)
         reason = "it is not one, or ends before its index" if headless else error.strerror
-        raise SourceError(f"{path} is not a video that can be read ({reason}); is the copy complete?") from None
+        raise SourceError(f"{path} cannot be read as a video ({reason}); is the copy complete?") from None
 
 
 def _listed(path: Path, words: dict[str, str]) -> tuple[VideoTimestamps, float]:
@@ -196,7 +196,7 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> VideoTimest
         if joined:
             notes = (
                 *notes,
-                "its clock starts again in the middle, as in concatenated files; the parts are joined",
+                "its clock restarts in the middle, as in concatenated files; the parts are joined",
             )
         begins = np.zeros(0, np.int64) if counted else keys[once]
         return VideoTimestamps(known, begins, unit, rate, True, decoding, counted, aspect, focal, notes)

@@ -68,4 +68,4 @@ class FolderFeed:
 
     def close(self) -> None:
         """End it; nothing more comes."""
-        self._state = replace(self._state, ended=True, reason="it was ended")
+        self._state = replace(self._state, ended=True, reason="stopped here")

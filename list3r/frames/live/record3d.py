@@ -63,7 +63,9 @@ class Record3dPhone:
         try:
             import lzfse  # noqa: F401
         except ImportError:
-            raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
+            raise OptionError(
+                "depth of Record3D is packed with LZFSE, which needs a package: pip install 'list3r[record3d]'"
+            ) from None
         self._serial, self._tell = serial, tell
         self._first: _PhoneFrame | None = None
         self._noted = set[str]()
@@ -83,7 +85,7 @@ class Record3dPhone:
                     self._note_once(f"pictures that are not {first.sizes.color[0]}x{first.sizes.color[1]} are left out")
                     continue
                 if again:
-                    self._note_once("the phone's poses after a lost connection are in another world and are left out")
+                    self._note_once("poses after a lost connection are in another frame of reference and are left out")
                 if abs(frame.intrinsics[0] / first.intrinsics[0] - 1) > _VARIES:
                     self._note_once("the focal length changes by more than 1 %: one camera serves all pictures")
                 pose = () if again else frame.pose

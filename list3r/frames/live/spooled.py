@@ -84,7 +84,7 @@ class StreamFeed:
         self._thread.join(2 * self._settings.silence_s)
 
     def _run(self) -> None:
-        reason = "it was ended"
+        reason = "stopped here"
         try:
             reason = self._follow()
         except SourceError as error:
@@ -111,13 +111,13 @@ class StreamFeed:
                 return f"the connection was lost ({reason}) and did not come back within {s.retry_s:g} s"
             if came_s is not None or reason != shown:
                 shown = reason
-                self._tell(f"no connection to {self._camera.name} ({reason}); it is tried again")
+                self._tell(f"no connection to {self._camera.name} ({reason}); trying again")
             with self._lock:
                 self._gap = True
                 self._state = replace(self._state, reconnects=self._state.reconnects + (came_s is not None))
             self._stop.wait(pause_s)
             pause_s = min(2 * pause_s, s.most_pause_s)
-        return "it was ended"
+        return "stopped here"
 
     def _receive(self) -> tuple[float | None, bool, str]:
         """Keep the pictures of one connection: when the last one came, whether the source is over, how it ended."""

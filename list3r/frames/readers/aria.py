@@ -178,7 +178,7 @@ def _opened(path: Path, stream: str) -> Any:
         raise SourceError(f"{path} is not a recording in VRS that can be read; is the copy complete?")
     streams = [str(s) for s in provider.get_all_streams()]
     if stream not in streams or not provider.get_num_data(StreamId(stream)):
-        raise SourceError(f"{path} has no pictures in the stream {stream}, but {', '.join(streams) or 'none'}")
+        raise SourceError(f"{path} has no pictures in the stream {stream}; it has {', '.join(streams) or 'none'}")
     return provider
 
 

@@ -40,7 +40,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     try:
         named = sorted((int(row[0]), row[1].strip()) for row in rows)
     except (ValueError, IndexError):
-        raise SourceError(f"{listing} is not `nanoseconds,filename` line by line; fix it") from None
+        raise SourceError(f"{listing} has lines that are not `nanoseconds,filename`; fix them") from None
     if not named:
         raise SourceError(f"{listing} names no picture; is the copy complete?")
     intrinsics, distortion, size, T_body_cam = _sensor(base / "cam0" / "sensor.yaml")

@@ -23,13 +23,15 @@ class JoinedVideos(Reader):
     def __init__(self, paths: Sequence[Path], options: SourceOptions) -> None:
         """Raises `SourceError` for a file that is no video or of another size, `OptionError` for a range."""
         if any(v is not None for v in (options.start, options.stop, options.start_s, options.end_s)):
-            raise OptionError("--frames, --start and --end are of one file; cut the files, or give one")
+            raise OptionError("--frames, --start and --end work on one file; cut the files, or give one")
         self._parts = [VideoSource(path, replace(options, more=None)) for path in paths]
         first = self._parts[0].info
         for path, part in zip(paths, self._parts, strict=True):
             if part.stored_size != self._parts[0].stored_size:
                 (h, w), (height, width) = part.stored_size, self._parts[0].stored_size
-                raise SourceError(f"{path} has pictures of {w}x{h}, {paths[0]} of {width}x{height}: not one recording")
+                raise SourceError(
+                    f"{path} has pictures of {w}x{h}, {paths[0]} of {width}x{height}; give files of one recording"
+                )
         self._positions = np.cumsum([0, *(p.info.frame_count for p in self._parts)]).tolist()
         self._numbers = np.cumsum([0, *(p.stored_count for p in self._parts)]).tolist()
         lengths = [p.time_s(p.stored_count - 1) - p.time_s(0) + 1.0 / p.info.fps for p in self._parts]

@@ -54,7 +54,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(_file(root, path, row, turned) for row in rows)
     if rows and not len(files.that_hold(POSE)) and any("transform_matrix" in row for row in rows):
         raise SourceError(
-            f"{path}: the transform_matrix of no frame is a rigid motion (4x4, row by row); fix it, or say --kind "
+            f"{path}: the transform_matrix of no frame is a rigid motion (4x4, row by row); fix it, or use --kind "
             "images to take colour alone"
         )
     fisheye = model == _FISHEYE and options.distortion is None

@@ -58,7 +58,7 @@ def _sequence_folder(root: Path) -> Path | None:
         return root
     inside = sorted(p for p in root.glob("seq-*") if p.is_dir() and any(_COLOR.match(q.name) for q in p.iterdir()))
     if len(inside) > 1:
-        raise SourceError(f"{root} holds {len(inside)} sequences; name one of them, like {inside[0]}")
+        raise SourceError(f"{root} holds {len(inside)} sequences; name one of them, such as {inside[0]}")
     return inside[0] if inside else None
 
 

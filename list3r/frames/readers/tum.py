@@ -60,7 +60,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
             raise SourceError(f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; fix depth.txt")
         if len(pairs) < len(colors):
             alone = len(colors) - len(pairs)
-            notes.append(f"{alone} of {len(colors)} colour images have no depth image in time and are left out")
+            notes.append(f"{alone} of {len(colors)} colour images have no depth image of their time and are left out")
         named: Iterator[Path | None] = (root / depths.name(d) for d in pairs[:, 1])
         picked = pairs[:, 0]
     else:

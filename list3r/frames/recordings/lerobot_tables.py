@@ -60,8 +60,8 @@ def read_episode(root: Path, keys: list[str], number: int | None) -> Episode:
     rows = _rows(root, columns)
     if number is None and len(rows) > 1:
         raise OptionError(
-            f"{root} has {len(rows)} episodes; choose one by --episode (0 to {max(rows)}), and take in further ones "
-            "by list3r update"
+            f"{root} has {len(rows)} episodes; choose one by --episode (0 to {max(rows)}), and add further ones "
+            "with `list3r update`"
         )
     chosen = next(iter(rows)) if number is None else number
     if chosen not in rows:
@@ -73,7 +73,7 @@ def read_episode(root: Path, keys: list[str], number: int | None) -> Episode:
         name = f"videos/{key}/chunk-{int(chunk):03d}/file-{int(file):03d}.mp4"
         videos[key] = (inside(root, name, root / INFO), float(begins_s))
         if not videos[key][0].is_file():
-            raise SourceError(f"{root / name} is missing, in which episode {chosen} lies; is the copy complete?")
+            raise SourceError(f"{root / name}, which holds episode {chosen}, is missing; is the copy complete?")
     return Episode(chosen, int(row["length"]), videos)
 
 

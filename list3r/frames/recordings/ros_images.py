@@ -70,7 +70,7 @@ def _rows(message: Any, kind: np.dtype[Any], channels: int) -> NDArray[Any]:
     used = width * channels * kind.itemsize
     data = np.asarray(message.data, np.uint8)
     if not 0 < height * width <= _MOST_PIXELS or step < used or len(data) < step * height:
-        raise FrameError(f"an image of {width}x{height} in {len(data)} bytes is cut off or misstated")
+        raise FrameError(f"an image of {width}x{height} in {len(data)} bytes is cut off, or its size is wrong")
     rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used]).view(kind)
     return rows.reshape((height, width) if channels == 1 else (height, width, channels))
 

@@ -54,9 +54,9 @@ class ZipMember:
     def read_bytes(self) -> bytes:
         """Raises `OSError` for a member that is missing, larger than `MOST_BYTES` or damaged."""
         if self.size < 0:
-            raise OSError(errno.ENOENT, "is missing")
+            raise OSError(errno.ENOENT, "it is missing")
         if self.size > MOST_BYTES:
-            raise OSError(errno.EFBIG, f"unpacks to {self.size} bytes")
+            raise OSError(errno.EFBIG, f"it unpacks to {self.size} bytes")
         try:
             return _archive(self.archive).read(self.member)
         except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError) as error:
@@ -148,7 +148,9 @@ def _lz4(data: bytes, count: int) -> bytes | None:
     try:
         from lz4.block import LZ4BlockError, decompress
     except ImportError:
-        raise OptionError("depth of ScanNet++ is packed with LZ4: pip install 'list3r[scannetpp]'") from None
+        raise OptionError(
+            "depth of ScanNet++ is packed with LZ4, which needs a package: pip install 'list3r[scannetpp]'"
+        ) from None
     try:
         return bytes(decompress(data, uncompressed_size=count))
     except LZ4BlockError:
@@ -173,7 +175,9 @@ def _lzfse(data: bytes, count: int) -> bytes | None:
     try:
         import lzfse
     except ImportError:
-        raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
+        raise OptionError(
+            "depth of Record3D is packed with LZFSE, which needs a package: pip install 'list3r[record3d]'"
+        ) from None
     fill = _filling(str(lzfse.__file__))
     if fill is not None:
         out = ctypes.create_string_buffer(count + 1)

@@ -203,12 +203,12 @@ def _camera(
     fx, fy, cx, cy = intrinsics
     if not (0 <= cx < width and 0 <= cy < height):
         raise OptionError(
-            f"{name}: centre ({cx:g}, {cy:g}) lies outside pictures of {_size(size)}: they are of pictures of another "
-            f"size; give those of {_size(size)}"
+            f"{name}: centre ({cx:g}, {cy:g}) lies outside pictures of {_size(size)}: give the intrinsics for "
+            "pictures of this size"
         )
     if _off_middle(cx, cy, width, height) > _OFF_MIDDLE and _off_middle(cx, cy, height, width) < _IN_MIDDLE:
         raise OptionError(
-            f"{name}: centre ({cx:g}, {cy:g}) is the middle of pictures of {height}x{width}, and these are "
+            f"{name}: centre ({cx:g}, {cy:g}) is the middle of pictures of {height}x{width}, but these are "
             f"{_size(size)}: give the camera of the pictures as they stand upright"
         )
     return Camera(width, height, fx, fy, cx, cy, distortion)
@@ -222,8 +222,8 @@ def _check_size(intrinsics: Intrinsics, size: tuple[int, int]) -> None:
         return
     fitting = ",".join(f"{v:.6g}" for v in (fx / x, fy / y, (cx + 0.5) / x - 0.5, (cy + 0.5) / y - 0.5))
     raise OptionError(
-        f"the source states a camera for pictures of {width}x{height} whose centre ({cx:g}, {cy:g}) is the middle of "
-        f"some of {round(x * width)}x{round(y * height)}; --intrinsics {fitting} would be that camera here"
+        f"the source states a camera for pictures of {width}x{height}, but its centre ({cx:g}, {cy:g}) is the middle "
+        f"of {round(x * width)}x{round(y * height)}; if it is the camera of those, give --intrinsics {fitting}"
     )
 
 

@@ -26,7 +26,9 @@ class Record3dWriter:
         try:
             import lzfse
         except ImportError:
-            raise OptionError("depth of Record3D is packed with LZFSE: pip install 'list3r[record3d]'") from None
+            raise OptionError(
+                "depth of Record3D is packed with LZFSE, which needs a package: pip install 'list3r[record3d]'"
+            ) from None
         self._pack = lzfse.compress
         self._camera, self._fps = camera, fps
         self._depth_size: tuple[int, int] | None = None

@@ -30,7 +30,7 @@ def write_weights(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None
 def load_weights(path: Path | None = None) -> Mapping[str, Float]:
     """Return the weights of a file, by default the shipped ones. Raises `OptionError` for what is wrong with it."""
     file = path or SHIPPED
-    fix = "write it again (training/train.py)" if path else "install list3r again"
+    fix = "make it again with training/train.py" if path else "install list3r again"
     try:
         with np.load(file, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}

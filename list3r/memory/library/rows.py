@@ -38,7 +38,7 @@ def pack_scores(p: PairScores) -> bytes:
 def unpack_scores(blob: bytes) -> PairScores:
     """Return the inverse of `pack_scores`. Raises `MemoryFileError` for a blob of another length."""
     if len(blob) % _SCORES.itemsize:
-        raise MemoryFileError(f"overlaps: {len(blob)} bytes are no whole scores; run `list3r verify` on the file")
+        raise MemoryFileError(f"overlaps: {len(blob)} bytes do not hold whole scores; run `list3r verify` on the file")
     found = np.frombuffer(blob, _SCORES)
     i, j, shared = (found[name].astype(np.int64) for name in ("i", "j", "shared"))
     return PairScores(i, j, found["i_on_j"].copy(), found["j_on_i"].copy(), shared, found["frame_iou"].copy())

@@ -134,7 +134,7 @@ def undo(store: Store, entry: int | None = None, author: str | None = None) -> E
         if entry is None:
             last = [e.entry for e in in_force if e.kind != "undo"]
             if not last:
-                raise OptionError(f"{store.path} has no edit to undo; give the ENTRY of a decision of the merge log")
+                raise OptionError(f"{store.path} has no edit to undo; for a decision of the merge log, give its ENTRY")
             entry = last[-1]
         chosen = next((e for e in edits if e.entry == entry), None)
         if chosen is None:

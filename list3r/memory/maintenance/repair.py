@@ -130,9 +130,9 @@ def _fold_in_log(path: Path) -> None:
 
 def _check_target(path: Path, target: Path) -> None:
     if not path.is_file():
-        raise MemoryFileError(f"{path} does not exist")
+        raise MemoryFileError(f"{path} does not exist; check the path")
     if target != path and target.exists():
-        raise MemoryFileError(f"{target} exists already; give --out a new name")
+        raise MemoryFileError(f"{target} already exists; give --out a new name")
     check_beside(path)
     if not target.resolve().parent.is_dir():
         raise MemoryFileError(f"the folder {target.resolve().parent} does not exist; create it first")

@@ -61,7 +61,7 @@ def explained(path: Path, error: Exception) -> str:
         return f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`"
     if "full" in text or "disk I/O" in text:
         return (
-            f"{path} could not be written, the disk is full or failing ({text}); free some space and give the command "
+            f"{path} could not be written, the disk is full or failing ({text}); free some space and run the command "
             "again, a build or an update with --resume"
         )
     if "readonly" in text:
@@ -118,10 +118,10 @@ def numbers(database: sqlite3.Connection) -> tuple[int, int]:
 def check_numbers(path: Path, application: int, version: int) -> None:
     """Raise `MemoryFileError` for a file of another program, or of a newer version of this one."""
     if application != APPLICATION_ID:
-        raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory")
+        raise MemoryFileError(f"{path} is an SQLite file, but not a LIST3R memory; name another file")
     if version > SCHEMA_VERSION:
         raise MemoryFileError(
-            f"{path} has schema version {version}, this program knows up to {SCHEMA_VERSION}; update list3r"
+            f"{path} is of a newer list3r (schema {version}; this one reads up to {SCHEMA_VERSION}); update list3r"
         )
 
 
@@ -134,7 +134,7 @@ def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None
         if found.get((kind, name)) != expected[kind, name]:
             state = "is not the one of" if (kind, name) in found else "is missing for"
             raise MemoryFileError(
-                f"{path}: the {kind} {name} {state} schema version {version}; the file is damaged or not ours"
+                f"{path}: the {kind} {name} {state} schema version {version}; the file is damaged or of another program"
             )
 
 
@@ -167,7 +167,7 @@ def write_empty(path: Path) -> None:
 
 def taken(path: Path) -> str:
     """What is said where a new memory is asked for under a name that is taken."""
-    return f"{path} exists already; use --resume to go on with it or --force to replace it"
+    return f"{path} already exists; use --resume to continue it or --force to replace it"
 
 
 def rename_exclusively(old: Path, new: Path) -> None:

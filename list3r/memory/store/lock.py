@@ -65,7 +65,9 @@ class WriterLock:
         except FileExistsError:
             pass
         except OSError as error:
-            raise MemoryFileError(f"{memory} cannot be written: {error.strerror}") from error
+            raise MemoryFileError(
+                f"{memory} cannot be written ({error.strerror}); check the permissions of its folder"
+            ) from error
         try:
             if not stat.S_ISREG(os.lstat(self._path).st_mode):
                 raise MemoryFileError(_in_the_way(memory, self._path))

@@ -200,7 +200,7 @@ def bad_words(database: sqlite3.Connection) -> Iterator[str]:
     if up_to_date(database):
         held = set(database.execute("SELECT word, instance, weight FROM words WHERE word != ''"))
         for instance in sorted({row[1] for row in held ^ set(expected_words(database))}, key=str):
-            yield f"words: those of instance {instance} are not what it is called"
+            yield f"words: those of instance {instance} are not those of its label and description"
 
 
 def unbelieved(database: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> list[Any]:

@@ -22,7 +22,7 @@ from list3r.memory.overlap.summaries import cameras_of
 from list3r.memory.records import ChunkRow
 from list3r.memory.store.store import Store
 
-_WANTED = "ID=0.095m, ID.height=0.095m, camera_height=1.5m or x,y,z:x,y,z=1.2m is needed"
+_WANTED = "give ID=0.095m, ID.height=0.095m, camera_height=1.5m or x,y,z:x,y,z=1.2m"
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "": 1.0}
 _SHORTEST_M, _LONGEST_M = 0.002, 1000.0
 
@@ -77,7 +77,7 @@ def parse_anchor(text: str) -> ScaleAnchor:
     if not equals or not math.isfinite(metres):
         raise OptionError(f"anchor {text!r}: {_WANTED}")
     if not _SHORTEST_M <= metres <= _LONGEST_M:
-        raise OptionError(f"anchor {text!r}: a length between {_SHORTEST_M:g} and {_LONGEST_M:g} m is needed")
+        raise OptionError(f"anchor {text!r}: give a length between {_SHORTEST_M:g} and {_LONGEST_M:g} m")
     if what == "camera_height":
         return ScaleAnchor(text, metres, "camera")
     named = re.fullmatch(r"#?([0-9]{1,18})(\.height)?", what)
@@ -176,8 +176,8 @@ def _length(store: Store, anchor: ScaleAnchor, chunks: list[ChunkRow]) -> tuple[
     instance = store.instances.get(store.ids.resolve(anchor.instance_id))
     if instance.component != chunks[0].component:
         raise OptionError(
-            f"#{instance.id} lies in a part of the memory that was never joined to the first one; its size says "
-            "nothing of that one's scale"
+            f"#{instance.id} lies in a part of the memory that was never joined to the first one; its size does "
+            "not give the scale of that one"
         )
     keys = tuple((o.chunk_id, o.local_id) for o in store.observations.of(instance.id))
     if anchor.kind == "size":

@@ -108,7 +108,7 @@ def parse(text: str) -> Phrase:
     """Parse a question. Raises `OptionError` for one that is empty, too long, or ends in a relation."""
     tokens = re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text.lower())  # names of predicates (next_to) come apart
     if not tokens:
-        raise OptionError(f"{text!r} has no word to look for; ask for example for: white mug on table")
+        raise OptionError(f"{text!r} has no word to search for; ask for something such as: white mug on table")
     if len(tokens) > _MOST_WORDS:
         raise OptionError(f"a question of {len(tokens)} words is too long; {_MOST_WORDS} are the most")
     return _sentence(tokens, text)
@@ -131,14 +131,14 @@ def _clause(tokens: list[str], text: str) -> Clause:
     words, rest = " ".join(tokens[:length]), tokens[length:]
     if predicates == ("between",):
         if "and" not in rest:
-            raise OptionError(f"{text!r}: between needs two things, as in: between 4 and the sofa")
+            raise OptionError(f"{text!r}: between needs two things, such as: between 4 and the sofa")
         middle = rest.index("and")
         one, two = rest[:middle], rest[middle + 1 :]
     else:
         one, two = rest, []
     for part in (one, *([two] if predicates == ("between",) else [])):
         if not [t for t in part if t not in _FILLERS]:
-            raise OptionError(f"{text!r}: say what it should be {words}, as in: mug {words} table")
+            raise OptionError(f"{text!r}: say what it should be {words}, such as: mug {words} table")
     other = _sentence(two, text) if two else None
     return Clause(words, predicates, _sentence(one, text), other)
 

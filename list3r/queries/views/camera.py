@@ -89,7 +89,7 @@ def camera_at_pose(
     except (TypeError, ValueError) as error:
         raise OptionError(f"quat must be four numbers w, x, y, z, not {quat_wxyz!r}") from error
     if quat.shape != (4,) or not np.isfinite(quat).all() or not 1e-9 < np.abs(quat).max() < 1e9:
-        raise OptionError(f"quat must be four finite numbers w, x, y, z, not all zero, not {quat_wxyz!r}")
+        raise OptionError(f"quat must be four finite numbers w, x, y, z, not all zero, not {str(quat.tolist())[:80]}")
     chunks = store.chunks.all(_checked_session(store, session))
     if not chunks:
         raise OptionError(f"{store.path} has no camera yet; give it a video first")

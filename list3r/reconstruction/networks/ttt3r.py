@@ -27,7 +27,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 def load(cls: Any, path: Path, device: torch.device) -> Any:
     """Return the network, its state updated as TTT3R does. Raises `OptionError` for the package of cut3r."""
     if not hasattr(cls, "forward_recurrent_lighter"):  # the one way of the two that cut3r has not
-        raise OptionError("ttt3r: the package dust3r that is found is that of cut3r; put src of TTT3R before it")
+        raise OptionError("ttt3r: the first package dust3r on PYTHONPATH is that of cut3r; put src of TTT3R before it")
     model = cut3r.load(cls, path, device)
     model.config.model_update_type = "ttt3r"
     return model

@@ -70,7 +70,7 @@ def _plan(path: Path) -> tuple[int, int]:
             length, overlap = (int(m.group(1)) for m in found if m is not None)
             if 0 < overlap < length:
                 return length, overlap
-    raise SourceError(f"{path} has no .yaml that says chunk_size and overlap of its chunks")
+    raise SourceError(f"{path} has no .yaml with the chunk_size and overlap of its chunks")
 
 
 def _views(found: dict[str, NDArray[Any]], file: Path) -> tuple[Views, bool]:

@@ -30,7 +30,7 @@ def convert_predictions(path: Path, folder: Path, options: OutputOptions | None 
         what = "is not a known output" if path.exists() else "does not exist"
         raise SourceError(f"{path} {what}; give {known}")
     if folder.exists():
-        raise ExportError(f"{folder} exists; name another folder or remove it first")
+        raise ExportError(f"{folder} already exists; name another folder or remove it first")
     if not folder.parent.is_dir():
         raise ExportError(f"the folder {folder.parent} does not exist; create it first")
     chosen = options or OutputOptions()

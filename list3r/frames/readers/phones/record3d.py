@@ -119,9 +119,9 @@ def find_file(path: Path, options: SourceOptions) -> FolderLayout:
                 raise SourceError(f"{path}: its metadata unpacks to more than {_MOST_METADATA} bytes")
             content = parse_json(archive.read("metadata"))
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise SourceError(f"{path} is not a complete zip file ({error}); is the upload complete?") from None
+        raise SourceError(f"{path} is not a complete zip file ({error}); is the copy complete?") from None
     except ValueError as error:
-        raise SourceError(f"{path}: its metadata is not JSON ({error}); export it from Record3D again") from None
+        raise SourceError(f"{path}: its metadata is not valid JSON ({error}); export it from Record3D again") from None
     return _layout(path, content, members, lambda name: ZipMember(path, name), options)
 
 
@@ -133,7 +133,7 @@ def _layout(
     named = (_PICTURE.fullmatch(name) for name in present)
     numbers = sorted(int(found[1]) for found in named if found)
     if not numbers:
-        raise SourceError(f"{where} holds no pictures rgbd/N.jpg; is the upload complete?")
+        raise SourceError(f"{where} holds no pictures rgbd/N.jpg; is the copy complete?")
     camera = PhoneCamera.of(where, content)
     poses, times = _poses(content), content.get("frameTimestamps")
     fps = content.get("fps")

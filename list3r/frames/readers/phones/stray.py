@@ -46,7 +46,7 @@ def open_recording(root: Path, options: SourceOptions) -> VideoWithDepth:
         {int(p.stem): p for p in depths if p.stem.isdigit()},
         _odometry(odometry) if odometry.is_file() else {},
         _MILLIMETRES,
-        f"{note or 'camera as said'}, {poses}",
+        f"{note or 'camera as given'}, {poses}",
         z_up=True,
         poses_drift=True,
         confidence=lambda number: root / "confidence" / f"{number:06d}.png",
@@ -58,7 +58,7 @@ def open_recording(root: Path, options: SourceOptions) -> VideoWithDepth:
 def _matrix(path: Path) -> tuple[Intrinsics, str]:
     """Return the camera, and how it is written."""
     if not path.is_file():
-        raise SourceError(f"{path} is missing; is the copy complete? --intrinsics fx,fy,cx,cy says the camera, too")
+        raise SourceError(f"{path} is missing; is the copy complete? Without it, give --intrinsics fx,fy,cx,cy")
     rows = read_numbers(path)
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         raise SourceError(f"{path} is not a 3x3 camera matrix; fix it, or give --intrinsics fx,fy,cx,cy")

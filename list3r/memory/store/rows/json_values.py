@@ -110,6 +110,6 @@ def _key(hint: Any, key: str) -> Any:
 
 def _checked(kind: Any, value: object) -> Any:
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        names = {(int, float): "number", (list, tuple): "list"}
-        raise ValueError(f"{repr(value)[:40]} is no {names.get(kind) or kind.__name__}")
+        names = {(int, float): "number", (list, tuple): "list", str: "text", int: "whole number", bool: "flag"}
+        raise ValueError(f"{repr(value)[:40]} is not a {names.get(kind, 'record')}")
     return value

@@ -92,7 +92,7 @@ _FIRST_FEATURE = (
 RULES: Mapping[str, Mapping[str, Rule]] = {
     "memory": {
         "key": _text(),
-        "value": Rule(f"length({{}}) <= {_MOST_JSON} AND list3r_value(key, {{}})", "what the program keeps there"),
+        "value": Rule(f"length({{}}) <= {_MOST_JSON} AND list3r_value(key, {{}})", "a value of that kind"),
     },
     "sessions": {
         "session_id": _integer(1),
@@ -352,7 +352,7 @@ def bad_references(database: sqlite3.Connection, name: str) -> Iterator[str]:
         chunks = "SELECT u AS chunk_id FROM overlaps UNION SELECT v FROM overlaps"
         alone = "SELECT chunk_id FROM redundant EXCEPT SELECT chunk_id FROM members"
         for (chunk_id,) in database.execute(f"{chunks} INTERSECT SELECT * FROM ({alone})"):
-            yield f"overlaps: chunk {chunk_id} is redundant, and meets none"
+            yield f"overlaps: chunk {chunk_id} is redundant and has none"
     if name == "aliases":
         yield from _circles(dict(database.execute("SELECT id, instance FROM aliases").fetchall()))
 

@@ -102,5 +102,5 @@ def _doubles(values: NDArray[np.float64]) -> bytes:
 def _bend(frames: bytes, twists: bytes) -> Bend:
     at, x = np.frombuffer(frames, "<f8"), np.frombuffer(twists, "<f8").reshape(-1, 7)
     if len(at) != len(x) or not len(at) or not np.isfinite(at).all() or not np.isfinite(x).all():
-        raise MemoryFileError("the bend is damaged")
+        raise MemoryFileError("the motion inside a chunk (bends) is damaged; run `list3r verify`")
     return Bend(at, x)

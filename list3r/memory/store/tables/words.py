@@ -97,7 +97,7 @@ class Words:
         for i in instances:
             weights = hundredths(i.label, i.structure, i.description, i.color_name)
             if sum(weights.get(word, 0) for word in wanted) != totals[i.id] and self._is_current():
-                self._connection.refuse(f"words: those of instance {i.id} are not what it is called")
+                self._connection.refuse(f"words: those of instance {i.id} are not those of its label and description")
 
     def _is_current(self) -> bool:
         """Whether the table holds the words that this program knows."""
