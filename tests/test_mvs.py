@@ -18,7 +18,7 @@ from list3r.reconstruction.mvs.fusion import DepthMap, carry, fill_flat
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up
 from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
-from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths
+from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths, shared_views
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
 COUNT = 20
@@ -219,6 +219,27 @@ def test_sources_have_parallax_and_stand_on_both_sides() -> None:
     still = np.tile(np.eye(4), (41, 1, 1))
     nothing = pair_views([20], posed, still, CAMERA, depth)
     assert choose_sources(0, nothing, still, sharp, 20, SweepViewSettings()) == []
+
+
+def test_a_frame_shares_little_with_a_close_look_at_a_part_of_it() -> None:
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, 2, 3] = [0.0, -0.2, -3.0, -3.2]  # two from near by, two from further back
+    posed, depth = np.ones(4, bool), np.array([1.0, 1.2, 4.0, 4.2])
+    pairs = pair_views([0, 2], posed, T, CAMERA, depth)
+    shared = shared_views(pairs, [0, 2], posed, T, CAMERA, depth)
+    assert pairs.overlap[0, 3] == 1.0 and shared[0, 3] < 0.3
+    assert shared[1, 3] > 0.7 and shared[0, 1] > 0.7
+
+
+def test_who_steps_back_sees_depth_all_the_way() -> None:
+    T = np.tile(np.eye(4), (COUNT, 1, 1))
+    T[:, 2, 3] = 0.9 - 1.8 * np.linspace(0.0, 1.0, COUNT)
+    T[:, 0, 3] = 0.02 * np.sin(np.arange(COUNT))
+    truth = np.stack([f.depth for f in frames_along(T, seed=101, noise=False)])[:, ::2, ::2]
+    frames = [shrunk(f) for f in frames_along(T, seed=101)]
+    depth, _ = dense_depth(PosedFrames(frames, np.ones(COUNT, bool), T, SMALL))
+    assert (depth > 0).mean(axis=(1, 2)).min() > 0.75
+    assert np.median(errors(depth, truth)) < 0.02
 
 
 def test_planes_are_as_many_as_the_parallax_needs() -> None:

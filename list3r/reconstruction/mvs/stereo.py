@@ -41,6 +41,7 @@ from list3r.reconstruction.mvs.views import (
     choose_sources,
     pair_views,
     plane_depths,
+    shared_views,
 )
 
 __all__ = ["MvsSettings", "PosedFrames", "Sparse", "dense_depth", "stereo_noise"]
@@ -58,6 +59,8 @@ class _Chunk:
     fine: Pictures
     keyframes: list[int]
     pairs: ViewPairs
+    shared: NDArray[np.float64]
+    """See `shared_views`. Shape (K, F)."""
     depth: NDArray[np.float64]
     """Typical depth of each frame, chunk units. Shape (F,)."""
     span: tuple[float, float]
@@ -169,7 +172,8 @@ def _prepare(given: PosedFrames, settings: MvsSettings, device: str) -> _Chunk |
     depth, span = known
     keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
     pairs = pair_views(keyframes, posed, T, fine.camera, depth)
-    return _Chunk(T, coarse, fine, keyframes, pairs, depth, span, sharp, device, settings)
+    shared = shared_views(pairs, keyframes, posed, T, fine.camera, depth)
+    return _Chunk(T, coarse, fine, keyframes, pairs, shared, depth, span, sharp, device, settings)
 
 
 def _sparse_depth(
@@ -207,7 +211,7 @@ def _probe(
         keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
         keyframes = keyframes[:: max(1, len(keyframes) // 4)]
         pairs = pair_views(keyframes, posed, T, coarse.camera, depth)
-        chunk = _Chunk(T, coarse, coarse, keyframes, pairs, depth, span, sharp, device, settings)
+        chunk = _Chunk(T, coarse, coarse, keyframes, pairs, pairs.overlap, depth, span, sharp, device, settings)
         found = [d for d in (_probed(chunk, row) for row in range(len(keyframes))) if len(d)]
         if not found:
             return None
@@ -312,7 +316,9 @@ def _filled(chunk: _Chunk, row: int, depth: DepthMap, frames: Sequence[Frame]) -
 
 def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> DepthMap | None:
     """Depth of a frame at the working width, from the keyframes nearest to it; None where there are none."""
-    rows = sorted(maps, key=lambda row: (_remoteness(chunk, row, position), row))[: chunk.settings.fusion.carried_from]
+    rows = sorted(maps, key=lambda row: (_remoteness(chunk, row, position), abs(chunk.keyframes[row] - position)))[
+        : chunk.settings.fusion.carried_from
+    ]
     if not rows:
         return None
     T = chunk.T_chunk_cam
@@ -322,8 +328,8 @@ def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> Depth
 
 
 def _remoteness(chunk: _Chunk, row: int, position: int) -> float:
-    """Return how little of a frame a keyframe sees; 0 for the frame itself."""
-    return 0.0 if chunk.keyframes[row] == position else 1.0 - float(chunk.pairs.overlap[row, position])
+    """Return how little of the same a keyframe and a frame see; 0 for the frame itself."""
+    return 0.0 if chunk.keyframes[row] == position else 1.0 - float(chunk.shared[row, position])
 
 
 def _full_size(

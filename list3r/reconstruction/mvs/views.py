@@ -73,6 +73,22 @@ def pair_views(
     return ViewPairs(overlap, angle, distance)
 
 
+def shared_views(
+    pairs: ViewPairs,
+    keyframes: Sequence[int],
+    posed: NDArray[np.bool_],
+    T_chunk_cam: Poses,
+    camera: Camera,
+    depth: Floats,
+) -> Floats:
+    """Return how much of the same a keyframe and a frame see: the smaller share of either picture. Shape (K, F).
+
+    A frame from further back sees all of a close keyframe's picture, which yet covers little of its own.
+    """
+    back = pair_views(range(len(posed)), posed, T_chunk_cam, camera, depth).overlap[:, list(keyframes)].T
+    return np.minimum(pairs.overlap, back)
+
+
 def choose_sources(
     row: int, pairs: ViewPairs, T_chunk_cam: Poses, sharp: Floats, key: int, settings: SweepViewSettings
 ) -> list[int]:
