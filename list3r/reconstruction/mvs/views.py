@@ -75,7 +75,7 @@ def _few_rays(camera: Camera) -> Floats:
     return np.concatenate([grid, np.ones((len(grid), 1))], axis=1)
 
 
-def _inside(points: Floats, T_cam_chunk: Poses, camera: Camera) -> NDArray[np.bool_]:
+def _inside(points: Floats, T_cam_chunk: NDArray[np.floating], camera: Camera) -> NDArray[np.bool_]:
     """Return which points (N, 3) lie in which cameras' pictures. Shape (C, N)."""
     local = np.einsum("fij,nj->fni", T_cam_chunk[:, :3, :3], points) + T_cam_chunk[:, None, :3, 3]
     z = np.maximum(local[..., 2], 1e-9)
