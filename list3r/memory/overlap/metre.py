@@ -1,4 +1,4 @@
-"""What a metre is in a chunk of relative scale: by the depth of what was seen, and by a floor too wide for a table."""
+"""What a metre is in a chunk of relative scale: by the depth of what was seen, and by the height over a wide floor."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ CAMERA_M = 1.4
 fr3_cabinet, 7-Scenes RedKitchen, TUM fr2_desk and fr1_xyz)."""
 DEPTH_SPREAD, CAMERA_SPREAD = 0.45, 0.15
 """Standard deviation of the logarithms of both, over all kinds of rooms."""
-WIDE = 12.0
-"""A level surface with more than this many squares of the cameras' height above it is a floor, whatever a unit is: seen
-from half a metre above it, a table would be 3 m2 large."""
+WIDE = 6.0
+"""A level surface of fewer squares of the cameras' height above it may be a table that fills the picture: seen from
+half a metre, one of 1.5 m2."""
 _POINTS, _AROUND, _TRIES, _LEAST = 2000, 10, 60, 20
 """Points that tell where a floor may be, those around each that tell its normal, tries, and points of a floor."""
 _LEVEL_DEG, _TILT_DEG = 10.0, 35.0
@@ -30,26 +30,37 @@ _THICK, _BELOW = 0.06, 0.03
 """Of the cameras' height: thickness of a floor. Share of the points that may lie below it."""
 _CELL = 0.25
 """Edge of the cells that measure a floor, of the cameras' height."""
+_MOST_APART = 2.0
+"""Deviations between what height and depths say, see `metre_by_height`."""
 
 
 def metre_by_sight(points: Array | Floats, depth: Array | Floats, T_chunk_cam: Array) -> float:
     """Return about what a metre is in chunk units.
 
     `points` (N, 3) are what posed cameras (F, 4, 4) saw, `depth` (N,) how far along z, chunk units. The median depth
-    counts as two metres. In a hall that is wrong by far; there the floor is wide, and the cameras' height tells more.
+    counts as two metres, which is wrong by a third in many rooms and by far in halls. Where the floor was seen, the
+    cameras' height tells more.
     """
     seen = depth > 0
     if not seen.any():
         return 1.0
     unit = float(np.median(depth[seen])) / ROOM_DEPTH_M
-    height = height_over_wide_floor(points[seen], T_chunk_cam)
-    if height is None:
+    return metre_by_height(height_over_floor(points[seen], T_chunk_cam), unit)
+
+
+def metre_by_height(height: float | None, unit: float) -> float:
+    """Return what a metre is by how high the cameras were, too, in units; `unit` is what it is by the depths.
+
+    Where both are too far apart, the camera was not held by a person, or the floor is none.
+    """
+    more = math.log(height / CAMERA_M / unit) if height is not None and height > 0 else 0.0
+    if abs(more) > _MOST_APART * math.hypot(CAMERA_SPREAD, DEPTH_SPREAD):
         return unit
-    return float(unit * (height / CAMERA_M / unit) ** (1.0 / (1.0 + (CAMERA_SPREAD / DEPTH_SPREAD) ** 2)))
+    return unit * math.exp(more / (1.0 + (CAMERA_SPREAD / DEPTH_SPREAD) ** 2))
 
 
-def height_over_wide_floor(points: Array | Floats, T_chunk_cam: Array) -> float | None:
-    """Return the median height of the cameras over a floor so wide that it is no table; None where none was seen."""
+def height_over_floor(points: Array | Floats, T_chunk_cam: Array) -> float | None:
+    """Return the median height of the cameras over the floor; None where too little of one was seen."""
     if len(points) < _POINTS // 10 or len(T_chunk_cam) == 0:
         return None
     up = -T_chunk_cam[:, :3, 1].mean(axis=0)
