@@ -22,7 +22,6 @@ from list3r.instances.geometric.fusion import (
 from list3r.instances.geometric.kernels import read_across
 from list3r.instances.geometric.registration import align_views, moved_view
 from list3r.instances.settings import AnchorViewSettings, InstanceSettings
-from list3r.memory.overlap.metre import metre_by_sight
 from list3r.reconstruction.base import Reconstruction, backproject
 
 
@@ -179,18 +178,12 @@ def _sharpness(color: NDArray[np.uint8]) -> float:
 
 
 def working_unit(reconstruction: Reconstruction) -> float:
-    """Chunk units per metre: 1 when metric, else about, by what was seen (see `metre_by_sight`)."""
+    """Chunk units per metre: 1 when metric, else such that the median depth counts as two metres."""
     if reconstruction.scale_kind == "metric":
         return 1.0
-    some = slice(None, None, max(1, len(reconstruction.depth) // 10))
-    depth, camera = reconstruction.depth[some, ::8, ::8], reconstruction.camera
-    image, row, column = np.nonzero(depth > 0)
-    z = depth[image, row, column]
-    x, y = (8 * column - camera.cx) / camera.fx, (8 * row - camera.cy) / camera.fy
-    rays = np.stack([x, y, np.ones_like(x)], axis=1)
-    T = reconstruction.T_chunk_cam[some][image]
-    points = np.einsum("nij,nj->ni", T[:, :3, :3], rays * z[:, None]) + T[:, :3, 3]
-    return metre_by_sight(points, z, reconstruction.T_chunk_cam[reconstruction.posed])
+    sample = reconstruction.depth[:: max(1, len(reconstruction.depth) // 10), ::8, ::8]
+    sample = sample[sample > 0]
+    return float(np.median(sample)) / 2.0 if len(sample) else 1.0
 
 
 def _neighbours(reconstruction: Reconstruction, position: int, settings: AnchorViewSettings) -> list[int]:

@@ -235,7 +235,7 @@ def _without(summary: ChunkSummary, left_out: frozenset[int]) -> ChunkSummary:
 
 
 def _unit(store: Store, chunk: ChunkRow) -> float:
-    """Return what a metre is in chunk units by what the cameras saw, as discovery reckons it."""
+    """Return about what a metre is in chunk units, by what the cameras saw."""
     samples = store.chunks.samples(chunk.chunk_id)
     T_chunk_cam = samples.T_chunk_cam[np.searchsorted(samples.camera_frames, samples.frame)]
     depth = np.einsum("ni,ni->n", samples.points - T_chunk_cam[:, :3, 3], T_chunk_cam[:, :3, 2])
