@@ -18,7 +18,7 @@ from list3r.reconstruction.mvs.fusion import DepthMap, carry, fill_flat
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up
 from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
-from list3r.reconstruction.mvs.views import choose_sources, pair_views, plane_depths
+from list3r.reconstruction.mvs.views import choose_carried, choose_sources, pair_views, plane_depths, seen_parts
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
 COUNT = 20
@@ -219,6 +219,29 @@ def test_sources_have_parallax_and_stand_on_both_sides() -> None:
     still = np.tile(np.eye(4), (41, 1, 1))
     nothing = pair_views([20], posed, still, CAMERA, depth)
     assert choose_sources(0, nothing, still, sharp, 20, SweepViewSettings()) == []
+
+
+def test_depth_is_taken_over_from_close_looks_and_from_what_sees_the_rest() -> None:
+    T = np.tile(np.eye(4), (12, 1, 1))
+    T[:, 2, 3] = np.repeat([0.0, -3.0], (8, 4))  # eight close looks at the middle, four from further back
+    posed, depth, keys = np.ones(12, bool), np.repeat([1.0, 4.0], (8, 4)), [*range(8), 9, 10]
+    overlap = pair_views(keys, posed, T, CAMERA, depth).overlap[:, 11]
+    parts = seen_parts(keys, posed, T, CAMERA, depth)[11]
+    chosen = choose_carried(overlap, parts, np.array([11 - k for k in keys]), DepthFusionSettings())
+    assert overlap.min() == 1.0 and parts[:8].mean() < 0.3 and parts[8:].all()
+    assert len(chosen) == 6 and {8, 9} <= set(chosen)
+    assert choose_carried(np.zeros(0), np.zeros((0, 20), bool), np.zeros(0, int), DepthFusionSettings()) == []
+
+
+def test_who_steps_back_sees_depth_all_the_way() -> None:
+    T = np.tile(np.eye(4), (COUNT, 1, 1))
+    T[:, 2, 3] = 0.9 - 1.8 * np.linspace(0.0, 1.0, COUNT)
+    T[:, 0, 3] = 0.02 * np.sin(np.arange(COUNT))
+    truth = np.stack([f.depth for f in frames_along(T, seed=101, noise=False)])[:, ::2, ::2]
+    frames = [shrunk(f) for f in frames_along(T, seed=101)]
+    depth, _ = dense_depth(PosedFrames(frames, np.ones(COUNT, bool), T, SMALL))
+    assert (depth > 0).mean(axis=(1, 2)).min() > 0.75
+    assert np.median(errors(depth, truth)) < 0.02
 
 
 def test_planes_are_as_many_as_the_parallax_needs() -> None:

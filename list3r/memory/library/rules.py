@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import zlib
 from dataclasses import dataclass, field, replace
 
@@ -18,6 +17,7 @@ from list3r.memory.library.labels import LabelSettings
 from list3r.memory.library.settled_poses import HysteresisSettings
 from list3r.memory.merging.movers import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
+from list3r.memory.overlap.metre import metre_by_height
 from list3r.memory.overlap.planes import place_planes
 from list3r.memory.overlap.summaries import Summaries, cameras_of, is_known, light_of, sample_of, world_unit
 from list3r.memory.overlap.voxels import ShapeSettings
@@ -150,13 +150,6 @@ WORLD = Fact[World | None]("library", World, None)
 """What the library was derived with; None where it has to be derived as a whole."""
 
 _UNIT = 0.02
-_CAMERA_M = 1.4
-"""Height at which people hold a camera; medians of recordings of others are 1.10, 1.42, 1.47 and 1.57 m (TUM
-fr3_cabinet, 7-Scenes RedKitchen, TUM fr2_desk and fr1_xyz)."""
-_CAMERA_SPREAD, _DEPTH_SPREAD = 0.15, 0.3
-"""Standard deviation of the logarithms of that height and of the median depth."""
-_MOST_APART = 2.0
-"""Deviations between what the two tell, beyond which the camera is not held by a person, or the floor is none."""
 _WHITE_L, _CAST = 3.0, 2.0
 """Changes that do not turn one colour name into another for more than borderline cases."""
 
@@ -219,12 +212,7 @@ def _by_cameras(store: Store, inside: list[ChunkRow], floor: float | None, unit:
     """Return what a metre is by the depths, which tell `unit`, and by how high over the floor the cameras were."""
     heights = cameras_of(store, sample_of(inside)).translation[:, 2]
     height = float(np.median(heights)) - floor if floor is not None and len(heights) else 0.0
-    if height <= 0.0:
-        return unit
-    more = math.log(height / _CAMERA_M / unit)
-    if abs(more) > _MOST_APART * math.hypot(_CAMERA_SPREAD, _DEPTH_SPREAD):
-        return unit
-    return unit * math.exp(more / (1.0 + (_CAMERA_SPREAD / _DEPTH_SPREAD) ** 2))
+    return metre_by_height(height, unit)
 
 
 def _rules(store: Store, s: ConsolidationSettings) -> int:

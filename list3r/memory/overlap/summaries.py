@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
+from list3r.memory.overlap.metre import metre_by_sight
 from list3r.memory.overlap.planes import Planes, chunk_planes
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, ShapeSettings, chunk_shapes, read_every, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
@@ -19,9 +20,6 @@ from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 T = TypeVar("T")
-
-ROOM_DEPTH_M = 2.0
-"""How far instances are from the camera indoors, on the median: what lends a relative memory its notion of a metre."""
 
 
 _ROUNDED = 1e-9
@@ -237,12 +235,11 @@ def _without(summary: ChunkSummary, left_out: frozenset[int]) -> ChunkSummary:
 
 
 def _unit(store: Store, chunk: ChunkRow) -> float:
-    """Return what a metre is in chunk units, by the median depth of what the cameras saw, as discovery reckons it."""
+    """Return about what a metre is in chunk units, by what the cameras saw."""
     samples = store.chunks.samples(chunk.chunk_id)
     T_chunk_cam = samples.T_chunk_cam[np.searchsorted(samples.camera_frames, samples.frame)]
     depth = np.einsum("ni,ni->n", samples.points - T_chunk_cam[:, :3, 3], T_chunk_cam[:, :3, 2])
-    seen = depth[depth > 0]
-    return float(np.median(seen)) / ROOM_DEPTH_M if len(seen) else 1.0
+    return metre_by_sight(samples.points, depth, samples.T_chunk_cam)
 
 
 def is_known(chunks: Iterable[ChunkRow], summaries: Mapping[int, ChunkSummary]) -> bool:

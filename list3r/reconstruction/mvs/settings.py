@@ -84,6 +84,8 @@ class DepthFusionSettings:
     """Deviation that filled depth is said to have, share of depth."""
     carried_from: int = 6
     """Keyframes whose depth is carried into a frame."""
+    carried_least: int = 2
+    """Keyframes that see each part of a frame at least, where there are as many."""
     carried_tolerance: float = 0.03
     """Depths of a pixel that are averaged lie no farther behind the nearest than this share of it."""
     enlarged_step: float = 0.04

@@ -36,11 +36,13 @@ from list3r.reconstruction.mvs.settings import (
 from list3r.reconstruction.mvs.sweep import CoarseDepth, DepthMatch, SweepReference, coarse_match, refine
 from list3r.reconstruction.mvs.views import (
     ViewPairs,
+    choose_carried,
     choose_keyframes,
     choose_neighbours,
     choose_sources,
     pair_views,
     plane_depths,
+    seen_parts,
 )
 
 __all__ = ["MvsSettings", "PosedFrames", "Sparse", "dense_depth", "stereo_noise"]
@@ -58,6 +60,8 @@ class _Chunk:
     fine: Pictures
     keyframes: list[int]
     pairs: ViewPairs
+    parts: NDArray[np.bool_]
+    """See `seen_parts`. Shape (F, K, N)."""
     depth: NDArray[np.float64]
     """Typical depth of each frame, chunk units. Shape (F,)."""
     span: tuple[float, float]
@@ -169,7 +173,8 @@ def _prepare(given: PosedFrames, settings: MvsSettings, device: str) -> _Chunk |
     depth, span = known
     keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
     pairs = pair_views(keyframes, posed, T, fine.camera, depth)
-    return _Chunk(T, coarse, fine, keyframes, pairs, depth, span, sharp, device, settings)
+    parts = seen_parts(keyframes, posed, T, fine.camera, depth)
+    return _Chunk(T, coarse, fine, keyframes, pairs, parts, depth, span, sharp, device, settings)
 
 
 def _sparse_depth(
@@ -207,7 +212,9 @@ def _probe(
         keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
         keyframes = keyframes[:: max(1, len(keyframes) // 4)]
         pairs = pair_views(keyframes, posed, T, coarse.camera, depth)
-        chunk = _Chunk(T, coarse, coarse, keyframes, pairs, depth, span, sharp, device, settings)
+        chunk = _Chunk(
+            T, coarse, coarse, keyframes, pairs, np.zeros((0, 0, 0), bool), depth, span, sharp, device, settings
+        )
         found = [d for d in (_probed(chunk, row) for row in range(len(keyframes))) if len(d)]
         if not found:
             return None
@@ -312,18 +319,20 @@ def _filled(chunk: _Chunk, row: int, depth: DepthMap, frames: Sequence[Frame]) -
 
 def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> DepthMap | None:
     """Depth of a frame at the working width, from the keyframes nearest to it; None where there are none."""
-    rows = sorted(maps, key=lambda row: (_remoteness(chunk, row, position), row))[: chunk.settings.fusion.carried_from]
+    known = sorted(maps)
+    if not known:
+        return None
+    overlap = np.array([chunk.pairs.overlap[row, position] for row in known])
+    overlap[[chunk.keyframes[row] == position for row in known]] = 1.0
+    apart = np.array([abs(chunk.keyframes[row] - position) for row in known])
+    best = choose_carried(overlap, chunk.parts[position, known], apart, chunk.settings.fusion)
+    rows = [known[k] for k in best]
     if not rows:
         return None
     T = chunk.T_chunk_cam
     warps = [Warp.between(T[chunk.keyframes[r]], T[position], chunk.fine.camera, chunk.device) for r in rows]
     carried = carry([maps[r] for r in rows], warps, chunk.settings.fusion)
     return fill_flat(carried, chunk.settings.fusion)
-
-
-def _remoteness(chunk: _Chunk, row: int, position: int) -> float:
-    """Return how little of a frame a keyframe sees; 0 for the frame itself."""
-    return 0.0 if chunk.keyframes[row] == position else 1.0 - float(chunk.pairs.overlap[row, position])
 
 
 def _full_size(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.mvs.images import Poses
-from list3r.reconstruction.mvs.settings import SweepViewSettings
+from list3r.reconstruction.mvs.settings import DepthFusionSettings, SweepViewSettings
 
 Floats = NDArray[np.float64]
 
@@ -51,19 +51,13 @@ def pair_views(
     keyframes: Sequence[int], posed: NDArray[np.bool_], T_chunk_cam: Poses, camera: Camera, depth: Floats
 ) -> ViewPairs:
     """Overlap and parallax of keyframes with all frames, from a few rays at the typical depth."""
-    u = np.linspace(0.1, 0.9, 5) * (camera.width - 1)
-    v = np.linspace(0.1, 0.9, 4) * (camera.height - 1)
-    grid = np.stack(np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy), axis=-1).reshape(-1, 2)
-    rays = np.concatenate([grid, np.ones((len(grid), 1))], axis=1)
+    rays = _few_rays(camera)
     centers, into = T_chunk_cam[:, :3, 3], np.linalg.inv(T_chunk_cam)
     shape = (len(keyframes), len(posed))
     overlap, angle, distance = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for row, key in enumerate(keyframes):
         points = rays * depth[key] @ T_chunk_cam[key, :3, :3].T + centers[key]
-        local = np.einsum("fij,nj->fni", into[:, :3, :3], points) + into[:, None, :3, 3]
-        z = np.maximum(local[..., 2], 1e-9)
-        x, y = local[..., 0] / z * camera.fx + camera.cx, local[..., 1] / z * camera.fy + camera.cy
-        seen = (local[..., 2] > 1e-9) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        seen = _inside(points, into, camera)
         a, b = points - centers[key], points[None] - centers[:, None]
         cosine = np.einsum("ni,fni->fn", a, b) / np.linalg.norm(a, axis=1) / np.maximum(np.linalg.norm(b, axis=2), 1e-9)
         overlap[row] = seen.mean(axis=1) * posed
@@ -71,6 +65,53 @@ def pair_views(
         angle[row] = np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)), axis=1))
         distance[row] = np.linalg.norm(centers - centers[key], axis=1)
     return ViewPairs(overlap, angle, distance)
+
+
+def _few_rays(camera: Camera) -> Floats:
+    """Return 20 rays all over a picture, with z = 1. Shape (20, 3)."""
+    u = np.linspace(0.1, 0.9, 5) * (camera.width - 1)
+    v = np.linspace(0.1, 0.9, 4) * (camera.height - 1)
+    grid = np.stack(np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy), axis=-1).reshape(-1, 2)
+    return np.concatenate([grid, np.ones((len(grid), 1))], axis=1)
+
+
+def _inside(points: Floats, T_cam_chunk: NDArray[np.floating], camera: Camera) -> NDArray[np.bool_]:
+    """Return which points (N, 3) lie in which cameras' pictures. Shape (C, N)."""
+    local = np.einsum("fij,nj->fni", T_cam_chunk[:, :3, :3], points) + T_cam_chunk[:, None, :3, 3]
+    z = np.maximum(local[..., 2], 1e-9)
+    x, y = local[..., 0] / z * camera.fx + camera.cx, local[..., 1] / z * camera.fy + camera.cy
+    return np.asarray((local[..., 2] > 1e-9) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+
+
+def seen_parts(
+    keyframes: Sequence[int], posed: NDArray[np.bool_], T_chunk_cam: Poses, camera: Camera, depth: Floats
+) -> NDArray[np.bool_]:
+    """Return which of a few rays of each frame, at its typical depth, each keyframe sees. Shape (F, K, N)."""
+    rays, into = _few_rays(camera), np.linalg.inv(T_chunk_cam[list(keyframes)])
+    out = np.zeros((len(posed), len(keyframes), len(rays)), dtype=bool)
+    for position in np.flatnonzero(posed).tolist():
+        points = rays * depth[position] @ T_chunk_cam[position, :3, :3].T + T_chunk_cam[position, :3, 3]
+        out[position] = _inside(points, into, camera)
+    return out
+
+
+def choose_carried(
+    overlap: Floats, parts: NDArray[np.bool_], apart: NDArray[np.int64], settings: DepthFusionSettings
+) -> list[int]:
+    """Return the keyframes whose depth a frame takes over, best first.
+
+    `overlap` (K,) is the share of each keyframe's picture that the frame sees: closer looks tell depth best. `parts`
+    (K, N) is what each sees of the frame, `apart` (K,) how many frames lie between. First come those that see parts
+    of which few others tell: all close looks at one part lie in the frame as a whole, and leave the rest without depth.
+    """
+    order = [int(k) for k in np.lexsort((apart, -overlap)) if overlap[k] > 0]
+    told, first = np.zeros(parts.shape[1], dtype=np.int64), list[int]()
+    for k in order:
+        if (parts[k] & (told < settings.carried_least)).sum() >= 2:
+            first.append(k)
+            told += parts[k]
+    first = first[: settings.carried_from]
+    return first + [k for k in order if k not in first][: settings.carried_from - len(first)]
 
 
 def choose_sources(
