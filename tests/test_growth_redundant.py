@@ -95,6 +95,30 @@ def test_redundant_chunks_follow_edits_and_moves(walks: ModuleType, tmp_path: Pa
         assert store.verify() == []
 
 
+def test_redundant_chunks_are_carried_as_long_as_they_may_be_like_the_same(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "cull.l3r") as store:
+        begin(store)
+        for index, place in enumerate(STAY):
+            add(store, visit(walks, index, place, "corridor"))
+        things = {i.id: i.observations for i in store.instances.all()}
+
+        def end(*chunks: int, by: float) -> frozenset[int] | None:
+            there = Sim3.exp(np.array([0.0, by, 0.0, 0, 0, 0, 0]))
+            with store.transaction():
+                store.chunks.place(dict.fromkeys(chunks, there), dict.fromkeys(chunks, 1))
+                written = consolidate(store, settings=CULL).written
+            assert store.library.redundant.chunks() == {5, 6, 7, 8, 10}
+            assert {i.id: i.observations for i in store.instances.all()} == things
+            return written
+
+        assert end(5, 6, 7, by=0.008) == frozenset()
+        assert {k for k, row in store.library.settled.all().items() if row.carried[0] > 0.004} == {5, 6, 7}
+        assert end(5, 6, 7, by=0.016) is not None
+        assert not any(store.library.settled.all()[k].carried.any() for k in (5, 6, 7))
+        assert end(1, 2, 3, 4, 9, by=0.009) == frozenset()
+        assert store.verify() == []
+
+
 def with_thing(walks: ModuleType, made: ChunkResult, number: int) -> ChunkResult:
     """A chunk in which one more thing has come to stand."""
     frames, count = made.frame_indices, len(made.library.instances)
