@@ -1,11 +1,12 @@
-"""Which 64 chunks tell what holds for all of a long memory: a power of two as step, as now, or the least step.
+"""Which 64 chunks tell what holds for all of a long memory: one of each pair, a power of two as step, the least step.
 
     python benchmarks/sampled.py --videos corridor:1,loop:1 --chunks 140,260 --json FILE
 
 Walks through simulated homes, there and back until there are as many chunks as are asked for, are placed and derived
 as a build does (`feedforward_sim`). Of each memory up, its floor and the light are told with the sample of now
-(`sample_of`), with that of before decision 0167, and of all chunks. Up is compared with that of the true world, laid
-over the memory by its cameras; the light by how many of the instances are described in other words by it.
+(`sample_of`), by the step of decision 0167, by that of before, and of all chunks. Up is compared with that of the true
+world, laid over the memory by its cameras; the light by how many instances are described in other words than by that of
+all chunks.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ from list3r.association.overlap.motion import flag_dynamic
 from list3r.evaluation.trajectory import Trajectory, align
 from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+from list3r.memory.description.colors import Reference
 from list3r.memory.library.rows import in_light
 from list3r.memory.library.rules import WORLD
 from list3r.memory.overlap import summaries
+from list3r.memory.overlap.planes import place_planes
 from list3r.memory.store.store import Store
 from list3r.memory.world import gravity
 from list3r.pipeline.mapping import add_chunk, finish_session
@@ -39,14 +42,20 @@ LENGTH, OVERLAP = 40, 12
 """Frames of a chunk, and those that it shares with the next."""
 
 
-def every_nth(chunks: Sequence[Any]) -> list[Any]:
-    """The sample of before: at most 64 chunks, by the least step."""
+def least_step(chunks: Sequence[Any]) -> list[Any]:
+    """The sample of before decision 0167: at most 64 chunks, by the least step."""
     return list(chunks[:: max(1, -(-len(chunks) // SAMPLED))])
+
+
+def power_of_two(chunks: Sequence[Any]) -> list[Any]:
+    """The sample of decision 0167."""
+    return list(chunks[:: 1 << ((len(chunks) - 1) // SAMPLED).bit_length()])
 
 
 SAMPLES: dict[str, Callable[[Sequence[Any]], list[Any]]] = {
     "now": summaries.sample_of,
-    "before": every_nth,
+    "power of two": power_of_two,
+    "least step": least_step,
     "all": list,
 }
 
@@ -95,27 +104,23 @@ def there_and_back(video: SimulatedVideo, frames: int) -> SimulatedVideo:
     lap = np.concatenate([np.arange(count), np.arange(count - 2, 0, -1)])
     at, step = np.resize(lap, frames), float(video.time_s[1] - video.time_s[0])
     rows = {name: getattr(video, name)[at] for name in ("T_world_cam", "depth", "ids")}
-    return replace(video, time_s=step * np.arange(frames), cuts=(), **rows)
+    return replace(video, time_s=np.arange(frames, dtype=np.float64) * step, cuts=(), **rows)
 
 
 def told(store: Store, video: Any, name: str) -> dict[str, Any]:
     """What a sample tells of a memory."""
     sample, known = SAMPLES[name], summaries.chunk_summaries(store)
-    summaries.sample_of = sample  # type: ignore[assignment]
     chunks = store.chunks.all()
     first = min(c.component for c in chunks)
     inside = [c for c in chunks if c.component == first]
     rows = sample(inside)
-    planes = gravity.place_planes([(known.planes(c.chunk_id), c.S_world_chunk) for c in rows])
+    planes = place_planes([(known.planes(c.chunk_id), c.S_world_chunk) for c in rows])
+    summaries.sample_of = SAMPLES["all"]  # type: ignore[assignment]
     unit = summaries.world_unit(rows, known)
     found = gravity.gravity_from_planes(planes, summaries.cameras_of(store, rows), unit)
-    light, world = summaries.light_of(chunks, known), store.facts[WORLD]
+    light = summaries.light_of(sample(chunks), known)
+    words, others = (described(store, x) for x in (light, summaries.light_of(chunks, known)))
     summaries.sample_of = SAMPLES["now"]  # type: ignore[assignment]
-    assert world is not None
-    looks = {x.instance: x for x in store.library.looks.all()}
-    plain = {i.id: i.description for i in store.instances.all()}
-    anew = (in_light(i, looks[i.id], replace(world, light=light), metric=False) for i in store.instances.all())
-    words = {i.id: i.description for i in anew if i is not None}
     return {
         "sampled": len(rows),
         "status": found.status,
@@ -123,9 +128,21 @@ def told(store: Store, video: Any, name: str) -> dict[str, Any]:
         "floor": None if found.floor_height is None else round(found.floor_height / unit, 4),
         "unit": round(unit, 5),
         "light": [round(float(x), 3) for x in np.ravel(np.concatenate([np.ravel(v) for v in vars(light).values()]))],
-        "other_words": sum(plain[k] != text for k, text in words.items()),
-        "instances": len(plain),
+        "other_words": sum(words[k] != others[k] for k in words),
+        "instances": len(words),
     }
+
+
+def described(store: Store, light: Reference) -> dict[int, str]:
+    """The words for all instances in a light."""
+    world = store.facts[WORLD]
+    assert world is not None
+    looks, metric = {x.instance: x for x in store.library.looks.all()}, store.facts.scale_kind != "relative"
+    out = {}
+    for i in store.instances.all():
+        anew = in_light(i, looks[i.id], replace(world, light=light), metric=metric)
+        out[i.id] = i.description if anew is None else anew.description
+    return out
 
 
 def _up_error(store: Store, video: Any, up: np.ndarray, chunks: set[int]) -> float:
