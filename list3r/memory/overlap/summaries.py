@@ -212,7 +212,8 @@ def sample_of(chunks: Sequence[T]) -> list[T]:
     """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is decided by them.
 
     Of pairs one stays, the earlier or the later one by a sequence without a period, until there are so few. So a walk
-    to and fro is not asked about one end alone, and of more chunks it is some of the same and later ones.
+    to and fro is not asked about one end alone, and of more chunks it is some of the same and later ones (decision
+    0172).
     """
     kept = np.arange(len(chunks))
     while len(kept) > _SAMPLED:
