@@ -178,6 +178,21 @@ def test_some_instances_of_a_chunk_meet_others_as_all_of_them_do(walks: ModuleTy
         assert np.allclose(np.bincount(a.owner, on) / np.bincount(a.owner), every[:, n])
 
 
+def test_some_of_some_instances_keep_their_samples(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "one.l3r") as store:
+        begin(store)
+        add(store, visit(walks, 0, 0, "corridor"))
+        shapes = chunk_summaries(store)[1].shapes
+    count = len(shapes.local_id)
+    shapes = replace(shapes, samples=np.arange(count + 1), sample_owner=np.arange(-1, count, dtype=np.int32))
+    one, two = np.arange(count) % 3 > 0, np.arange(count) % 4 > 0
+    twice, once = shapes.only(one).only(two[one]), shapes.only(one & two)
+    mine = once.sample_owner < len(once.local_id)
+    assert np.array_equal(twice.sample_owner[mine], once.sample_owner[mine]) and mine.sum() == 1 + len(once.local_id)
+    assert (twice.sample_owner[~mine] >= len(once.local_id)).all()
+    assert len(set(twice.sample_owner.tolist())) == count + 1
+
+
 def test_votes_for_what_is_redundant_count_as_they_come_and_all_at_once(walks: ModuleType, tmp_path: Path) -> None:
     with Store.create(tmp_path / "cull.l3r") as store:
         begin(store)

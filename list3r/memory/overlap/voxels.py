@@ -130,7 +130,8 @@ class ChunkShapes:
         points, cells = kept[self.owner], kept[self.occupied_owner]
         rows: dict[str, Any] = {name: getattr(self, name)[kept] for name in _ROWS}
         lists: dict[str, Any] = {name: tuple(compress(getattr(self, name), kept)) for name in _LISTS}
-        owners = np.append(number, -1).astype(np.int32)[self.sample_owner]
+        owners, known = self.sample_owner.copy(), (self.sample_owner >= 0) & (self.sample_owner < len(kept))
+        owners[known] = number[owners[known]]
         return replace(
             self,
             points=self.points[points],
