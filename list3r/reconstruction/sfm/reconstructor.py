@@ -32,7 +32,6 @@ from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, st
 from list3r.reconstruction.sfm.mapping import MapProblem, Matches, SparseMap, build_maps, triangulate
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
-from list3r.reconstruction.sfm.two_view import verified_rows
 
 Poses = NDArray[np.float64]
 
@@ -144,8 +143,7 @@ class SfmReconstructor:
         seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
-        verified = None if free else verified_rows(wider, camera, s.mapping)
-        return build_maps(wider, camera, free_camera=free, settings=s.mapping, verified=verified)
+        return build_maps(wider, camera, free_camera=free, settings=s.mapping)
 
     def _given(
         self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera
