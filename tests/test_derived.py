@@ -6,6 +6,7 @@ import gc
 import weakref
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -64,6 +65,13 @@ def test_what_nobody_asked_for_in_the_last_turns_is_dropped() -> None:
     assert kept.get("left") is None and len(kept) == 1
     kept.put("large", "x" * 95)
     assert kept.get("asked") == "again"
+
+
+@pytest.mark.parametrize("period", [2, 3, 4])
+@pytest.mark.parametrize("count", [65, 100, 200, 1000])
+def test_the_sample_of_a_walk_to_and_fro_holds_all_places_about_as_often(count: int, period: int) -> None:
+    seen = np.bincount(np.array(sample_of(range(count))) % period, minlength=period)
+    assert seen.min() > 0.5 * seen.mean()
 
 
 @pytest.mark.parametrize("count", [1, 64, 65, 128, 129, 300, 1000, 1025])

@@ -95,6 +95,30 @@ def test_redundant_chunks_follow_edits_and_moves(walks: ModuleType, tmp_path: Pa
         assert store.verify() == []
 
 
+def test_redundant_chunks_are_carried_as_long_as_they_may_be_like_the_same(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "cull.l3r") as store:
+        begin(store)
+        for index, place in enumerate(STAY):
+            add(store, visit(walks, index, place, "corridor"))
+        things = {i.id: i.observations for i in store.instances.all()}
+
+        def end(*chunks: int, by: float) -> frozenset[int] | None:
+            there = Sim3.exp(np.array([0.0, by, 0.0, 0, 0, 0, 0]))
+            with store.transaction():
+                store.chunks.place(dict.fromkeys(chunks, there), dict.fromkeys(chunks, 1))
+                written = consolidate(store, settings=CULL).written
+            assert store.library.redundant.chunks() == {5, 6, 7, 8, 10}
+            assert {i.id: i.observations for i in store.instances.all()} == things
+            return written
+
+        assert end(5, 6, 7, by=0.008) == frozenset()
+        assert {k for k, row in store.library.settled.all().items() if row.carried[0] > 0.004} == {5, 6, 7}
+        assert end(5, 6, 7, by=0.016) is not None
+        assert not any(store.library.settled.all()[k].carried.any() for k in (5, 6, 7))
+        assert end(1, 2, 3, 4, 9, by=0.009) == frozenset()
+        assert store.verify() == []
+
+
 def with_thing(walks: ModuleType, made: ChunkResult, number: int) -> ChunkResult:
     """A chunk in which one more thing has come to stand."""
     frames, count = made.frame_indices, len(made.library.instances)
@@ -152,6 +176,21 @@ def test_some_instances_of_a_chunk_meet_others_as_all_of_them_do(walks: ModuleTy
     for n in np.flatnonzero(np.isnan(b.plane).any(axis=1)).tolist():
         on = lies_on(a.points, b.only(np.arange(len(b.local_id)) == n))
         assert np.allclose(np.bincount(a.owner, on) / np.bincount(a.owner), every[:, n])
+
+
+def test_some_of_some_instances_keep_their_samples(walks: ModuleType, tmp_path: Path) -> None:
+    with Store.create(tmp_path / "one.l3r") as store:
+        begin(store)
+        add(store, visit(walks, 0, 0, "corridor"))
+        shapes = chunk_summaries(store)[1].shapes
+    count = len(shapes.local_id)
+    shapes = replace(shapes, samples=np.arange(count + 1), sample_owner=np.arange(-1, count, dtype=np.int32))
+    one, two = np.arange(count) % 3 > 0, np.arange(count) % 4 > 0
+    twice, once = shapes.only(one).only(two[one]), shapes.only(one & two)
+    mine = once.sample_owner < len(once.local_id)
+    assert np.array_equal(twice.sample_owner[mine], once.sample_owner[mine]) and mine.sum() == 1 + len(once.local_id)
+    assert (twice.sample_owner[~mine] >= len(once.local_id)).all()
+    assert len(set(twice.sample_owner.tolist())) == count + 1
 
 
 def test_votes_for_what_is_redundant_count_as_they_come_and_all_at_once(walks: ModuleType, tmp_path: Path) -> None:

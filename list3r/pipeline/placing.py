@@ -59,7 +59,7 @@ def place_chunks(
     if bend:
         graph = _straightened(store, graph, chunks, metric, how)
     elif new is not None and how.nodes.enabled:
-        _look_ahead(store, graph, new, how)
+        _look_ahead(store, graph, new, metric, how)
         if fitted and metric:
             graph = _as_bent(store, graph, new, how)
     known = {} if store.facts.poses == "given" else graph.covariances
@@ -111,15 +111,16 @@ def _straightened(
     return graph
 
 
-def _look_ahead(store: Store, graph: GraphResult, new: int, how: AssociationSettings) -> None:
+def _look_ahead(store: Store, graph: GraphResult, new: int, metric: bool, how: AssociationSettings) -> None:
     """Find what the samples of a new chunk tell of how it and the one before bend while they are at hand, so that the
     end of the session has them all."""
     samples = SampledChunks.of(store)
     adjacent = (e for e in graph.edges if e.v == new and e.kind == "adjacent" and e.accepted and not in_one_frame(e))
     for edge in adjacent:
         if not poses_given(store, store.chunks.get(new).session_id):
-            samples.relations(edge, how.nodes.frames)
-            samples.nodes(new, how.nodes.frames)
+            found = samples.relations(edge, how.nodes.frames)
+            nodes = samples.nodes(edge.u, how.nodes.frames), samples.nodes(new, how.nodes.frames)
+            samples.ties(edge, found.rigid() if metric else found, nodes, how.nodes)
 
 
 def _as_bent(store: Store, graph: GraphResult, new: int, how: AssociationSettings) -> GraphResult:

@@ -21,7 +21,6 @@ from list3r.memory.library.region import Region
 from list3r.memory.merging.edges import NONE, links_of
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.overlap.pair_scores import Key, pair_scores
-from list3r.memory.overlap.summaries import ChunkSummary
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints, lies_on
 from list3r.memory.records import Instance, Observation
 from list3r.memory.runs import runs_seen, seen_together
@@ -103,7 +102,7 @@ def _seen_before(region: Region, k: int, earlier: Sequence[int]) -> tuple[NDArra
     settings, shapes = region.settings.redundancy, region.summaries[k].shapes
     points = region.settled[k].S_graph_chunk.apply(shapes.points)
     total = np.bincount(shapes.owner, minlength=len(shapes.local_id))
-    times, known = np.zeros(len(points), np.int64), total == 0
+    times, known, grown = np.zeros(len(points), np.int64), total == 0, region.store.derived.of(GrownCells)
     met: dict[int, Ints] = {}
     for u in earlier:
         row = region.rows[u]
@@ -112,7 +111,8 @@ def _seen_before(region: Region, k: int, earlier: Sequence[int]) -> tuple[NDArra
         at = np.flatnonzero(asked)
         if not len(at):
             continue
-        seen = at[lies_on(row.S_graph_chunk.inverse().apply(points[at]), _still(region.summary(u)))]
+        placed = row.S_graph_chunk.inverse().apply(points[at])
+        seen = at[lies_on(placed, region.still(u), grown)]
         times[seen] += 1
         met[u] = np.bincount(shapes.owner[seen], minlength=len(total))
         often = np.bincount(shapes.owner, times >= settings.chunks, minlength=len(total))
@@ -126,23 +126,16 @@ def _seen_before(region: Region, k: int, earlier: Sequence[int]) -> tuple[NDArra
     return known, [u for n, u in enumerate(met) if n in best]
 
 
-def _still(summary: ChunkSummary) -> ChunkShapes:
-    """Return what does not move."""
-    shapes = summary.shapes
-    return shapes.only(~np.isin(shapes.local_id, list(summary.motions))) if summary.motions else shapes
-
-
 def _like(region: Region, k: int, shapes: ChunkShapes, beside: Sequence[int]) -> dict[int, Key]:
     """Return the local instances of other chunks that some of a chunk are most like, by local id."""
     own, grown = Nodes.of([shapes], {k: region.pose(k)}), region.store.derived.of(GrownCells)
     best: dict[int, tuple[float, Key]] = {}
     for u in beside:
-        other = _still(region.summary(u))
         S_u_k = region.settled[u].S_graph_chunk.inverse() @ region.settled[k].S_graph_chunk
-        p = pair_scores(other, shapes, S_u_k, grown)
-        links = links_of(Nodes.of([other], {u: region.pose(u)}), own, p, region.settings.merging)
+        p = pair_scores(region.still(u), shapes, S_u_k, grown)
+        links = links_of(region.still_nodes(u), own, p, region.settings.merging)
         for n in np.flatnonzero(links.kind != NONE).tolist():
-            found = float(links.score[n]), (u, int(other.local_id[p.i[n]]))
+            found = float(links.score[n]), (u, int(region.still(u).local_id[p.i[n]]))
             local_id = int(shapes.local_id[p.j[n]])
             best[local_id] = max(found, best.get(local_id, found))
     return {local_id: key for local_id, (_, key) in best.items()}

@@ -103,6 +103,8 @@ class Region:
         self._poses: dict[int, Sim3] = {}
         self._marks: dict[int, bytes] = {}
         self._nodes: dict[int, Nodes] = {}
+        self._still: dict[int, ChunkShapes] = {}
+        self._still_nodes: dict[int, Nodes] = {}
         self._times: dict[int, dict[tuple[int, int], float]] = {}
         self._pairs: dict[tuple[int, int], _LinkedPair] = {}
         self._paired: set[int] = set()
@@ -125,6 +127,14 @@ class Region:
     def shapes(self, chunk_id: int) -> ChunkShapes:
         """Return the local instances of a chunk."""
         return self.summary(chunk_id).shapes
+
+    def still(self, chunk_id: int) -> ChunkShapes:
+        """Return those of them that do not move."""
+        if chunk_id not in self._still:
+            summary = self.summary(chunk_id)
+            moving = np.isin(summary.shapes.local_id, list(summary.motions))
+            self._still[chunk_id] = summary.shapes.only(~moving) if moving.any() else summary.shapes
+        return self._still[chunk_id]
 
     def keys_of(self, chunk_ids: Iterable[int]) -> set[Key]:
         """Return all local instances of some chunks."""
@@ -175,7 +185,7 @@ class Region:
 
     def look_again(self, chunk_id: int) -> None:
         """Take note that others of a chunk's local instances are redundant than before."""
-        for kept in (self._summary, self._nodes, self.rows):
+        for kept in (self._summary, self._nodes, self._still, self._still_nodes, self.rows):
             kept.pop(chunk_id, None)
         self._extents = None
         if chunk_id in self.store.library.redundant.chunks():
@@ -276,6 +286,12 @@ class Region:
         if chunk_id not in self._nodes:
             self._nodes[chunk_id] = Nodes.of([self.shapes(chunk_id)], {chunk_id: self.pose(chunk_id)})
         return self._nodes[chunk_id]
+
+    def still_nodes(self, chunk_id: int) -> Nodes:
+        """Return the same of those that do not move."""
+        if chunk_id not in self._still_nodes:
+            self._still_nodes[chunk_id] = Nodes.of([self.still(chunk_id)], {chunk_id: self.pose(chunk_id)})
+        return self._still_nodes[chunk_id]
 
     # ------------------------------------------------------------------ motion
 

@@ -20,6 +20,9 @@ _FAR_M = 0.5
 """Chunks whose points lie further apart than this share no instance."""
 _TURNED_DEG = 0.5
 """How far chunks may turn in the world before boxes along its axes are derived anew."""
+_ATTACHED = 3.0
+"""So many times as far may a chunk shift that is redundant as a whole against those that it is like: 12 mm, when
+surfaces meet within 30. Only whom it is like follows from where it lies (decision 0172)."""
 _FEW = 2
 """Chunks up to which those that moved are derived anew rather than carried."""
 
@@ -156,10 +159,13 @@ def carry(store: Store, T_world_graph: Sim3, settings: CarrySettings) -> Carried
     frames = stack([T_world_graph]), stack([_world_of_graph(store)])
     if _stirred(there, here, settings).sum() <= _FEW and not _stirred(*frames, settings).any():
         return None
+    attached = np.isin(ids, list(store.library.redundant.chunks()))
     pairs = np.searchsorted(ids, np.array(_compared(store, rows), np.int64).reshape(-1, 2))
     upright = np.array([c.component == settings.upright for c in placed])
-    slack = np.array([r.carried for r in rows.values()]) + _shifted(by, moves, extents, pairs, upright, settings.metre)
+    shifted = _shifted(by, moves, extents, pairs, (upright, attached), settings.metre)
+    slack = np.array([r.carried for r in rows.values()]) + shifted
     most = np.array([settings.poses.move_m, settings.poses.turn_deg, settings.up_deg, _TURNED_DEG])
+    most = most * np.where(attached[:, None], [_ATTACHED, _ATTACHED, 1.0, 1.0], 1.0)
     others = (slack > most).any(axis=1) | (np.abs(by.scale - 1.0) > settings.poses.scale)
     boxes = carried_boxes(by, extents)
     apart, together, strange = _near_otherwise(store, ids, by, (extents, boxes), settings.metre)
@@ -208,16 +214,25 @@ def _compared(store: Store, rows: Mapping[int, SettledRow]) -> list[tuple[int, i
 
 
 def _shifted(
-    by: Sim3, moves: Sim3, extents: Array, pairs: NDArray[np.int64], upright: NDArray[np.bool_], metre: float
+    by: Sim3,
+    moves: Sim3,
+    extents: Array,
+    pairs: NDArray[np.int64],
+    kinds: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    metre: float,
 ) -> Array:
     """Return how far chunks shift and turn at most against one that they were compared with, how far their up turns,
     and they themselves, metres and degrees. Shape (N, 4).
+
+    `kinds` are the chunks that stand upright, and those that are redundant as a whole, (N,) each: nothing of another
+    one follows from where these lie.
     """
-    out = np.zeros((len(extents), 4))
+    (upright, attached), out = kinds, np.zeros((len(extents), 4))
     shift, turn = _between(by, extents, pairs)
-    for column in pairs.T:
-        np.maximum.at(out[:, 0], column, shift / metre)
-        np.maximum.at(out[:, 1], column, turn)
+    for column, other in (pairs.T, pairs.T[::-1]):
+        told = attached[column] | ~attached[other]
+        np.maximum.at(out[:, 0], column[told], shift[told] / metre)
+        np.maximum.at(out[:, 1], column[told], turn[told])
     out[:, 2] = np.where(upright, _degrees(moves.rotation[:, 2, 2]), 0.0)
     out[:, 3] = _degrees((np.trace(moves.rotation, axis1=1, axis2=2) - 1.0) / 2.0)
     return out

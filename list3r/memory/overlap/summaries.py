@@ -64,6 +64,8 @@ _KEPT_TURNS = 16
 """Chunks that come until a summary that none of them asked for is dropped: a walk leaves most of a house behind."""
 _SAMPLED = 64
 """Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
+_GOLDEN = (5.0**0.5 - 1.0) / 2.0
+"""Multiples of it are spread most evenly over [0, 1) once whole numbers are taken off."""
 
 
 def _bytes_of(summary: ChunkSummary) -> int:
@@ -207,10 +209,16 @@ def chunk_summaries(store: Store, settings: ShapeSettings | None = None, *, hold
 def sample_of(chunks: Sequence[T]) -> list[T]:
     """At most 64 chunks, spread evenly over those given: what holds for all of a long memory is decided by them.
 
-    Of more chunks it is some of them and later ones.
+    Of pairs one stays, the earlier or the later one by a sequence without a period, until there are so few. So a walk
+    to and fro is not asked about one end alone, and of more chunks it is some of the same and later ones (decision
+    0172).
     """
-    step = 1 << ((len(chunks) - 1) // _SAMPLED).bit_length() if chunks else 1
-    return list(chunks[::step])
+    kept = np.arange(len(chunks))
+    while len(kept) > _SAMPLED:
+        pairs = len(kept) // 2
+        later = np.arange(1, pairs + 1) * _GOLDEN % 1.0 < 0.5
+        kept = np.append(np.where(later, kept[1 : 2 * pairs : 2], kept[: 2 * pairs : 2]), kept[2 * pairs :])
+    return [chunks[k] for k in kept.tolist()]
 
 
 def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> ChunkSummary:

@@ -39,13 +39,6 @@ _REACH = np.array(
     dtype=np.int64,
 )
 """What to add to a key to get the cells whose centres lie within two cells: the tolerance."""
-_NEAREST = _REACH[
-    np.argsort(
-        [i * i + j * j + k * k for i in _SPAN for j in _SPAN for k in _SPAN if i * i + j * j + k * k <= 4],
-        kind="stable",
-    )
-].tolist()
-"""The same, the nearest first."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +130,8 @@ class ChunkShapes:
         points, cells = kept[self.owner], kept[self.occupied_owner]
         rows: dict[str, Any] = {name: getattr(self, name)[kept] for name in _ROWS}
         lists: dict[str, Any] = {name: tuple(compress(getattr(self, name), kept)) for name in _LISTS}
-        owners = np.append(number, -1).astype(np.int32)[self.sample_owner]
+        owners, known = self.sample_owner.copy(), (self.sample_owner >= 0) & (self.sample_owner < len(kept))
+        owners[known] = number[owners[known]]
         return replace(
             self,
             points=self.points[points],
@@ -277,18 +271,14 @@ def coverage(source: ChunkShapes, target: ChunkShapes, S_target_source: Sim3, gr
             out = np.zeros(shape)
             out[:, near] = coverage(source, target.only(near), S_target_source)
             return out
-    cells, cell_owner = (GrownCells() if grown is None else grown).of(target)
-    hits = np.zeros(shape[0] * shape[1])
-    for level in np.unique(target.level):
-        keys = _key(np.floor(p / (target.grain * 2.0**level)).astype(np.int64), int(level))
-        start, stop = np.searchsorted(cells, keys, "left"), np.searchsorted(cells, keys, "right")
-        times = stop - start
-        which = np.repeat(np.arange(len(p)), times)
-        offset = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
-        at = cell_owner[np.repeat(start, times) + offset]
-        plane = target.plane[at]
-        off = np.abs(np.einsum("ij,ij->i", p[which], plane[:, :3]) + plane[:, 3])
-        on = ~(off > 2.0 * target.grain)
+    cells, grains = (GrownCells() if grown is None else grown).of(target), _grains(p, target)
+    hits, flat = np.zeros(shape[0] * shape[1]), ~np.isnan(target.plane[:, 0])
+    for level in np.unique(target.level).tolist():
+        which, at = cells.holders(_key_at(grains, level))
+        asked = np.flatnonzero(flat[at])
+        plane, on = target.plane[at[asked]], np.ones(len(at), bool)
+        off = np.abs(np.einsum("ij,ij->i", p[which[asked]], plane[:, :3]) + plane[:, 3])
+        on[asked] = off <= 2.0 * target.grain
         hits += np.bincount(source.owner[which[on]] * shape[1] + at[on], minlength=len(hits))
     total = np.bincount(source.owner, minlength=shape[0])
     return np.asarray(hits.reshape(shape) / np.maximum(total, 1)[:, None])
@@ -311,19 +301,15 @@ def _reached(target: ChunkShapes) -> tuple[Array, Array]:
     return low, high
 
 
-def lies_on(points: Array, target: ChunkShapes) -> NDArray[np.bool_]:
+def lies_on(points: Array, target: ChunkShapes, grown: GrownCells | None = None) -> NDArray[np.bool_]:
     """Return which points, in the frame of a chunk, lie within the tolerance of any of its instances. Shape (P,)."""
-    found, occupied = np.zeros(len(points), bool), np.sort(target.occupied)
-    if len(occupied) == 0:
+    found = np.zeros(len(points), bool)
+    if len(target.occupied) == 0:
         return found
+    cells, grains = (GrownCells() if grown is None else grown).of(target), _grains(points, target)
     for level in np.unique(target.level).tolist():
         left = np.flatnonzero(~found)
-        keys = _key(np.floor(points[left] / (target.grain * 2.0**level)).astype(np.int64), level)
-        for reach in _NEAREST:
-            at = np.minimum(np.searchsorted(occupied, keys + reach), len(occupied) - 1)
-            met = occupied[at] == keys + reach
-            found[left[met]] = True
-            left, keys = left[~met], keys[~met]
+        found[left[cells.find(_key_at(grains[:, left], level))[0]]] = True
     return found
 
 
@@ -339,21 +325,36 @@ class _Grown:
 
     shapes: ChunkShapes
     keys: Ints
-    """Ascending. Shape (G,)."""
+    """Ascending, each once. Shape (G,)."""
+    start: NDArray[np.int32]
+    """Where the instances of each begin among `owner`. Shape (G + 1,)."""
     owner: NDArray[np.int32]
-    """Instance of each. Shape (G,)."""
+    """Shape (O,)."""
+
+    def find(self, keys: Ints) -> tuple[Ints, Ints]:
+        """Return which of some keys are those of cells, and the numbers of these. Shape (F,) each."""
+        at = np.searchsorted(self.keys, keys)
+        at[at == len(self.keys)] = 0
+        found = np.flatnonzero(self.keys[at] == keys)
+        return found, at[found]
+
+    def holders(self, keys: Ints) -> tuple[Ints, NDArray[np.int32]]:
+        """Return which of some keys lie within the tolerance of an instance, and of which one. Shape (H,) each."""
+        found, at = self.find(keys)
+        times = self.start[at + 1] - self.start[at]
+        offset = np.repeat(self.start[at] - (np.cumsum(times) - times), times)
+        return np.repeat(found, times), self.owner[np.arange(len(offset)) + offset]
 
 
 class GrownCells(LruCache[int, _Grown]):
     """Grown cells of the chunks that were compared last: they take more memory than all else of a chunk."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, lambda grown: grown.keys.nbytes + grown.owner.nbytes, _KEPT_TURNS)
+        super().__init__(_KEPT_BYTES, lambda g: g.keys.nbytes + g.start.nbytes + g.owner.nbytes, _KEPT_TURNS)
 
-    def of(self, shapes: ChunkShapes) -> tuple[Ints, NDArray[np.int32]]:
-        """Return the keys of the cells within the tolerance of each instance, and their instances. Shape (G,) each."""
-        found = self.get(id(shapes)) or self.put(id(shapes), _grown(shapes))
-        return found.keys, found.owner
+    def of(self, shapes: ChunkShapes) -> _Grown:
+        """Return the cells within the tolerance of each instance."""
+        return self.get(id(shapes)) or self.put(id(shapes), _grown(shapes))
 
 
 def _grown(shapes: ChunkShapes) -> _Grown:
@@ -362,7 +363,9 @@ def _grown(shapes: ChunkShapes) -> _Grown:
     keys = _stack(parts, np.int64)
     owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
     order = np.argsort(keys, kind="stable")
-    return _Grown(shapes, keys[order], owner[order])
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    return _Grown(shapes, keys[first], np.append(first, len(keys)).astype(np.int32), owner[order])
 
 
 def _distinct(keys: Ints) -> Ints:
@@ -383,9 +386,21 @@ def _own_grid(points: Array, grain: float, crowd: float, at_least: int) -> tuple
     return level, cell[first], first
 
 
+def _grains(points: Array, shapes: ChunkShapes) -> Ints:
+    """Return the finest cells that points in the frame of a chunk lie in. Shape (P, 3) -> (3, P)."""
+    return np.asarray(np.floor(points.T / shapes.grain).astype(np.int64))
+
+
+def _key_at(grains: Ints, level: int) -> Ints:
+    """Return keys of the cells of a level that finest ones lie in: twice as large ones from level to level. Shape
+    (3, P) -> (P,).
+    """
+    return _key((grains >> level).T, level)
+
+
 def _key(cells: Ints, level: int) -> Ints:
-    c = np.clip(cells + _HALF, 0, 2 * _HALF - 1)
-    return np.asarray(level << 3 * _BITS | c[:, 0] << 2 * _BITS | c[:, 1] << _BITS | c[:, 2], dtype=np.int64)
+    x, y, z = np.minimum(np.maximum(cells.T + _HALF, 0), 2 * _HALF - 1)
+    return np.asarray(((level << _BITS | x) << _BITS | y) << _BITS | z, dtype=np.int64)
 
 
 def seen_xyxy(boxes: Sequence[NDArray[np.float32]], image_size: tuple[int, int], blind: float) -> Array:
