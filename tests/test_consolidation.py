@@ -344,7 +344,7 @@ def test_a_relative_memory_tells_no_centimetres(tmp_path: Path) -> None:
         assert all("cm" not in i.description and " m" not in i.description for i in store.instances.all())
 
 
-@pytest.mark.parametrize(("depth", "metre"), [(2.0, 1.05), (3.0, 1.14), (8.0, 4.0)])
+@pytest.mark.parametrize(("depth", "metre"), [(2.0, 1.05), (3.0, 1.10), (8.0, 4.0)])
 def test_a_metre_of_a_relative_memory_is_told_by_depths_and_by_the_height_of_the_cameras(
     tmp_path: Path, depth: float, metre: float
 ) -> None:

@@ -210,7 +210,7 @@ def test_poses_that_drift_are_a_prior_unless_asked_otherwise() -> None:
 
 @pytest.mark.parametrize(
     ("changes", "why"),
-    [({"has_poses": False}, "no poses"), ({"poses_metric": False}, "unit of their own")],
+    [({"has_poses": False}, "no poses"), ({"poses_metric": False}, "another unit")],
 )
 def test_a_prior_that_cannot_serve_is_refused(changes: dict[str, object], why: str) -> None:
     with pytest.raises(OptionError, match=why):

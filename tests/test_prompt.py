@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -84,7 +85,7 @@ def test_more_tokens_tell_more(many: SceneMemory) -> None:
 def test_too_few_tokens_are_refused_with_how_many_it_takes(many: SceneMemory) -> None:
     with pytest.raises(OptionError, match=r"takes (\d+)") as caught:
         many.prompt(10)
-    least = int(str(caught.value).split()[-1])
+    least = int(re.findall(r"takes (\d+)", str(caught.value))[0])
     assert many.prompt(least).tokens == least
     with pytest.raises(OptionError):
         many.prompt(least - 1)

@@ -86,7 +86,7 @@ def test_settings_that_cannot_be_read_are_one_line(tmp_path: Path) -> None:
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
             store.sessions.add("walk", "", {"association": {"solved_whole": "all"}}, 3)
-        with pytest.raises(MemoryFileError, match="'all' is no int"):
+        with pytest.raises(MemoryFileError, match="'all' is not a whole number"):
             stored_settings(store, AssociationSettings, "association")
         with pytest.raises(MemoryFileError, match="session 1"):
             session_settings(store.sessions.all()[0])

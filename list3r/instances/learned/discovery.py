@@ -76,7 +76,10 @@ class LearnedDiscoverer(CloudDiscoverer):
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, Features]:
         settings = self.settings.segment
         shown = [views.view(p) for p in views.anchors]
-        cloud = build_cloud(shown, settings.voxel_m * views.unit)
+        computed = views.reconstruction.depth_noise is not None
+        sensed = not computed and views.reconstruction.scale_kind == "metric"
+        voxel = settings.voxel_m if sensed else settings.computed_voxel_m
+        cloud = build_cloud(shown, voxel * views.unit)
         poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
         planes = find_planes(cloud, self._learned.plane_area_m2 * views.unit**2, views.unit)
         up = estimate_up(planes, poses)
@@ -84,7 +87,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         if not len(cloud.keys):
             self._scraps = None
             return cloud, Segmentation(np.zeros(0, np.int32), (), up), np.zeros((0, 64), np.float32)
-        around = Surroundings(up, views.unit, height, views.reconstruction.depth_noise is not None)
+        around = Surroundings(up, views.unit, height, computed)
         surface = chunk_surface(cloud, shown, around)
         cut = cut_cloud(surface, self._weights, self._learned.cut)
         if around.computed:
