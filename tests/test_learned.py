@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from list3r.frames.base import SourceInfo
 from list3r.instances.geometric.cloud import Cloud, build_cloud, pack
+from list3r.instances.geometric.fusion import View
 from list3r.instances.geometric.planes import find_planes
-from list3r.instances.geometric.views import chunk_views, forget_views
+from list3r.instances.geometric.views import chunk_views, forget_views, working_unit
+from list3r.instances.learned import discovery
 from list3r.instances.learned import graph as graphs
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CloudCut, spread_labels
@@ -22,11 +26,12 @@ from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
 from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
 from list3r.instances.registry import make_discoverer
-from list3r.instances.settings import InstanceSettings
+from list3r.instances.settings import InstanceSettings, SegmentSettings
 from list3r.memory.errors import OptionError
 from list3r.pipeline.choice import settings_asked, settings_resumed
 from list3r.pipeline.request import BuildRequest
 from list3r.pipeline.settings import BuildSettings
+from list3r.reconstruction.base import DepthNoise
 from tests.test_instances_library import SCENE, render, walk
 
 
@@ -200,6 +205,31 @@ def test_pieces_and_their_graph_are_the_same_however_much_is_worked_out_at_once(
     assert np.array_equal(once.labels, again.labels)
     for a, b in zip(astuple(once.graph), astuple(again.graph), strict=True):
         assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("changes", "voxel"),
+    [({}, 0.016), ({"depth_noise": DepthNoise(0.0, 0.001, 0.02)}, 0.01), ({"scale_kind": "relative"}, 0.01)],
+)
+def test_voxels_are_larger_where_a_sensor_measured_depth(
+    changes: dict[str, Any], voxel: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, reconstruction = walk(SCENE)
+    seen = replace(reconstruction, **changes)
+    anchor = chunk_views(frames, seen, InstanceSettings()).anchors[0]
+    used: list[float] = []
+
+    def noted(views: Sequence[View], size: float) -> Cloud:
+        used.append(size)
+        return build_cloud(views, size)
+
+    monkeypatch.setattr(discovery, "build_cloud", noted)
+    LearnedDiscoverer(InstanceSettings())(frames, seen, anchor)
+    forget_views()
+    assert used[0] == pytest.approx(voxel * working_unit(seen))
+    for name in ("voxel_m", "computed_voxel_m"):
+        with pytest.raises(OptionError, match="must be positive"):
+            InstanceSettings(segment=SegmentSettings(**{name: 0.0}))
 
 
 def most_of(labels: np.ndarray) -> int:

@@ -178,5 +178,6 @@ class InstanceSettings:
     def __post_init__(self) -> None:
         if self.anchor_step < 1:
             raise OptionError(f"anchor step {self.anchor_step} must be at least 1 frame")
-        if self.segment.voxel_m <= 0:
-            raise OptionError(f"voxel size {self.segment.voxel_m} m must be positive")
+        for voxel in (self.segment.voxel_m, self.segment.computed_voxel_m):
+            if not voxel > 0:
+                raise OptionError(f"voxel size {voxel} m must be positive")
