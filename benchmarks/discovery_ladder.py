@@ -99,20 +99,20 @@ def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, 
     reconstruction = reconstruction_of(film, seed=seed)
     views = chunk_views(frames, reconstruction, settings)
     shown = [views.view(p) for p in views.anchors]
-    cloud = build_cloud(shown, settings.segment.voxel_m * views.unit)
+    computed = reconstruction.depth_noise is not None
+    voxel = settings.segment.computed_voxel_m if computed else settings.segment.voxel_m
+    cloud = build_cloud(shown, voxel * views.unit)
     poses = reconstruction.T_chunk_cam
     up = estimate_up(find_planes(cloud, 0.25 * views.unit**2, views.unit), poses)
-    computed = reconstruction.depth_noise is not None
     around = Surroundings(up, views.unit, float(np.median(poses[:, :3, 3] @ up)), computed)
     ids = tuple(film.ids[p][:: views.stride, :: views.stride].astype(np.int32) for p in views.anchors)
     bound = frozenset(t.id for t in film.things if t.structure)
     chunk = Chunk(film, views, chunk_surface(cloud, shown, around), voxel_truth(cloud, ids), bound)
-    true_up = poses[0, :3, :3] @ film.T_world_cam[0, :3, :3].T @ np.array([0.0, 0.0, 1.0])
     discoverer = LearnedDiscoverer(settings, weights)
     out: dict[str, dict[str, Any]] = {}
 
     def told(cut: Callable[[int], Proposals]) -> dict[str, Any]:
-        return figures(film, views, [select_prompts(cut(p), settings) for p in views.anchors], true_up)
+        return figures(film, views, [select_prompts(cut(p), settings) for p in views.anchors])
 
     true = TrueDiscoverer(film)
     out["true"] = told(lambda p: true(frames, reconstruction, p))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import list3r
+from list3r.cli.app import run
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.maintenance.scraps import derive_scraps
 from list3r.memory.maintenance.unlisted import derive_unlisted
@@ -115,3 +116,11 @@ def test_a_memory_with_its_scraps_can_only_be_read(tmp_path: Path) -> None:
         list3r.open(path, writable=True, min_confidence=0.2)
     with pytest.raises(OptionError, match="between 0 and 1"):
         list3r.open(path, min_confidence=1.5)
+
+
+def test_a_list_of_nothing_says_how_many_are_doubtful(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = build(tmp_path / "m.l3r", [with_scraps(k, [FLOOR], [MUG]) for k in range(2)])
+    assert run(["list", str(path)]) == 0
+    said = capsys.readouterr()
+    assert said.out == "nothing found\n" and said.err.startswith("1 doubtful instance")
+    assert run(["list", str(path), "--json"]) == 0 and not capsys.readouterr().err

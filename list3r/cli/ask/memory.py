@@ -11,7 +11,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
-from list3r.cli.terminal import say
+from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
     from list3r.memory.records import DetectedLabel, Instance, Relation
@@ -102,6 +102,12 @@ def list_instances(
         for i in kept
     ]
     print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind", "state"])
+    if not rows and min_confidence is None and at is None:
+        with open_memory(memory, 0.0) as scene:
+            doubtful = len(scene.instances(structure=False))
+        if doubtful:
+            kind = "1 doubtful instance is" if doubtful == 1 else f"{doubtful} doubtful instances are"
+            note(f"{kind} not listed: add --min-confidence 0")
 
 
 def _give_or_take(sigma: float | None, units: str) -> str:
