@@ -4,9 +4,11 @@ PYTHONPATH=. python benchmarks/discovery_memory.py --seeds 5101-5103 --keep FOLD
 PYTHONPATH=. python benchmarks/discovery_memory.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
 
 The worlds and the house are those of `discovery.py`, every frame filmed, so that a walk is two chunks; poses are given,
-off by a drift of some millimetres. A thing counts from 150 pixels in a view; its true box is that of its visible
-surface. `split` and `joined` are told by masks: pairs of listed instances of which most pixels lie on one true thing,
-and pairs of true things that one instance holds half of each, both for each true thing.
+off by a drift of some millimetres; memory and truth are laid on one another by all cameras. A thing counts from 150
+pixels with depth in a view, and its true box is that of its surface that has depth in some view: what lies beyond the
+reach of the sensor cannot be laid anywhere. `split` and `joined` are told by masks: pairs of listed instances of which
+most pixels lie on one true thing, and pairs of true things that one instance holds half of each, both for each true
+thing.
 """
 
 from __future__ import annotations
@@ -93,6 +95,7 @@ def write_film(root: Path, film: Film, seed: int) -> None:
     (root / "calibration.txt").write_text(f"{c.fx} {c.fy} {c.cx} {c.cy}\n")
     off = film.T_world_cam[0] @ reconstruction_of(film, seed=seed).T_chunk_cam
     write_tum(root / "groundtruth.txt", Trajectory(film.time_s, off))
+    write_tum(root / "cameras.txt", Trajectory(film.time_s, film.T_world_cam))
     boxes, largest = true_boxes(film)
     entries = []
     for thing in film.things:
@@ -107,7 +110,7 @@ def write_film(root: Path, film: Film, seed: int) -> None:
 
 
 def true_boxes(film: Film) -> tuple[dict[int, Any], dict[int, int]]:
-    """The boxes of the visible surfaces of things by id, and the pixels of their largest views."""
+    """The boxes by id of the surfaces of things that have depth, and the pixels with depth of their largest views."""
     from list3r.reconstruction.base import backproject
 
     points: list[NDArray[np.float32]] = []
@@ -116,8 +119,9 @@ def true_boxes(film: Film) -> tuple[dict[int, Any], dict[int, int]]:
     for k in range(0, len(film.time_s), 4):
         T, depth = film.T_world_cam[k], film.true_depth[k]
         points.append((backproject(depth, film.camera) @ T[:3, :3].T + T[:3, 3])[::2, ::2].astype(np.float32))
-        ids.append(np.where(depth > 0, film.ids[k], 0)[::2, ::2].astype(np.int64) - 1)
-        area = np.bincount(film.ids[k].ravel())
+        seen = np.where(film.depth[k] > 0, film.ids[k], 0).astype(np.int64)
+        ids.append(seen[::2, ::2] - 1)
+        area = np.bincount(seen.ravel())
         for thing in np.flatnonzero(area).tolist():
             largest[thing] = max(largest.get(thing, 0), int(area[thing]))
     return {k + 1: box for k, box in gathered_boxes(points, ids).items()}, largest
@@ -136,7 +140,7 @@ def measured(walk: Path, method: str) -> dict[str, Any]:
         poses = store.trajectory.poses()
         T = np.array([S.as_matrix() for _, S in poses])
         path = Trajectory(np.array([f.time_s for f, _ in poses]), T)
-    S = alignment_of(read_tum(walk / "groundtruth.txt"), path, with_scale=False)
+    S = alignment_of(read_tum(walk / "cameras.txt"), path, with_scale=False)
     found = evaluate_scene(scene, truth, S, MIN_PX)
     frames = range(0, FRAMES, EVERY)
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
