@@ -37,6 +37,7 @@ from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, 
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import first_verdicts, names_of, thing_features
 from list3r.instances.learned.weights import load_weights
+from list3r.instances.settings import SegmentSettings
 from training.graphs import surroundings_of
 from training.samples import Sample, sample_of
 from training.worlds.catalogue import LABELS
@@ -186,7 +187,8 @@ def _calls(label: str) -> frozenset[str]:
 def listed(sample: Sample) -> dict[str, NDArray[Any]]:
     """Features and verdicts of the things of a chunk, and what each fits best by voxels and how well."""
     weights = load_weights()
-    cloud = sample.cloud()
+    voxels = SegmentSettings()
+    cloud = sample.cloud(voxels.computed_voxel_m if sample.computed else voxels.voxel_m)
     truth = sample.truth_of(cloud).astype(np.int64)
     surface = chunk_surface(cloud, sample.views, surroundings_of(sample))
     parts, graph, told = join_parts(surface, cut_pieces(surface), weights, CutSettings())
