@@ -100,8 +100,7 @@ def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, 
     views = chunk_views(frames, reconstruction, settings)
     shown = [views.view(p) for p in views.anchors]
     computed = reconstruction.depth_noise is not None
-    voxel = settings.segment.computed_voxel_m if computed else settings.segment.voxel_m
-    cloud = build_cloud(shown, voxel * views.unit)
+    cloud = build_cloud(shown, settings.segment.grain_m(sensed=not computed) * views.unit)
     poses = reconstruction.T_chunk_cam
     up = estimate_up(find_planes(cloud, 0.25 * views.unit**2, views.unit), poses)
     around = Surroundings(up, views.unit, float(np.median(poses[:, :3, 3] @ up)), computed)

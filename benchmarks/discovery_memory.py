@@ -57,7 +57,7 @@ def main() -> None:
         for seed in seeds_of(args.seeds):
             kind = "house" if args.house else "fitted" if args.fitted else "world"
             walk = (args.keep or Path(scratch)) / f"{kind}-{seed}"
-            if not (walk / "truth.json").exists():
+            if not all((walk / name).exists() for name in ("cameras.txt", "truth.json")):
                 write_film(walk, film_of(seed, args.house, fitted=args.fitted), seed)
             for method in args.methods.split(","):
                 rows.append({"method": method, "seed": seed, **measured(walk, method)})

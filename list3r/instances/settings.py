@@ -46,6 +46,10 @@ class SegmentSettings:
     computed_voxel_m: float = 0.01
     """The same where no sensor measured depth: larger voxels lose things there."""
 
+    def grain_m(self, *, sensed: bool) -> float:
+        """Return the size of voxels, metres, for depth that a sensor measured or that was computed."""
+        return self.voxel_m if sensed else self.computed_voxel_m
+
 
 @dataclass(frozen=True)
 class MaskTrackSettings:

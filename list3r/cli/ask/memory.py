@@ -107,7 +107,7 @@ def list_instances(
             doubtful = len(scene.instances(structure=False))
         if doubtful:
             kind = "1 doubtful instance is" if doubtful == 1 else f"{doubtful} doubtful instances are"
-            note(f"{kind} not listed: add --min-confidence 0")
+            note(f"{kind} not listed: --min-confidence 0 shows what there is")
 
 
 def _give_or_take(sigma: float | None, units: str) -> str:

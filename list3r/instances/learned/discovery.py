@@ -78,8 +78,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         shown = [views.view(p) for p in views.anchors]
         computed = views.reconstruction.depth_noise is not None
         sensed = not computed and views.reconstruction.scale_kind == "metric"
-        voxel = settings.voxel_m if sensed else settings.computed_voxel_m
-        cloud = build_cloud(shown, voxel * views.unit)
+        cloud = build_cloud(shown, settings.grain_m(sensed=sensed) * views.unit)
         poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
         planes = find_planes(cloud, self._learned.plane_area_m2 * views.unit**2, views.unit)
         up = estimate_up(planes, poses)
