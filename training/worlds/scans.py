@@ -63,6 +63,8 @@ def _read_pcd(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return points (N, 3) and labels (N,), without points at the origin, which scanners write for none."""
     import open3d as o3d
 
+    if not file.is_file():
+        raise SourceError(f"{file} does not exist")
     found = o3d.t.io.read_point_cloud(str(file))
     if "positions" not in found.point or "label" not in found.point:
         raise SourceError(f"{file.name} is no point cloud with labels: PCD with x, y, z and label is read")
