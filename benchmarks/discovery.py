@@ -2,6 +2,7 @@
 
 PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --json benchmarks/results/discovery.json
 PYTHONPATH=. python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
+PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --colour grey
 
 Worlds come from `training/worlds` with families, textures and a sensor that training never shows; the house is one that
 others furnished (MIT-0), given by its folder. Each walk is one chunk with poses that drift by some millimetres; the
@@ -20,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from calibration import calibration
 from machine import machine, write_json
@@ -53,6 +55,7 @@ def main() -> None:
     parser.add_argument("--sensor", help="structured, tof, lidar or computed; without it each world draws one")
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
     parser.add_argument("--house", type=Path, help="folder of a Gazebo world, or a labelled scan (PCD); walks there")
+    parser.add_argument("--colour", choices=("grey", "none"), help="pictures without hue, or without anything to see")
     parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
     parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it beside")
     parser.add_argument("--json", type=Path)
@@ -62,6 +65,8 @@ def main() -> None:
     methods = [*filter(None, args.methods.split(",")), *(n for n in weights if n != "learned")]
     for seed in seeds_of(args.seeds):
         film = film_of(seed, args.sensor, args.house, fitted=args.fitted)
+        if args.colour:
+            film = replace(film[0], color=without_colour(film[0].color, args.colour)), film[1]
         for method in methods:
             said = judge(film, seed, method, weights.get(method))
             rows.append({"method": method, "seed": seed, "sensor": film[0].sensor, **said})
@@ -71,6 +76,7 @@ def main() -> None:
     for method, entry in table.items():
         print(method, json.dumps(entry))
     source = "house" if args.house else "fitted worlds" if args.fitted else "worlds"
+    source += f", colour: {args.colour}" if args.colour else ""
     write_json(args.json, {"source": source, "least_px": MIN_PX, "mean": table, "walks": rows})
 
 
@@ -91,6 +97,13 @@ def film_of(seed: int, sensor: str | None, house: Path | None, *, fitted: bool =
         return film_house(house, seed, sensor or ("structured", "lidar", "tof")[seed % 3]), 2
     settings = FilmSettings(seed, held_out=True, sensor=sensor, fitted=fitted)
     return make_film(settings), settings.every
+
+
+def without_colour(color: NDArray[np.uint8], left: str) -> NDArray[np.uint8]:
+    """Pictures (F, H, W, 3) of which brightness is left ("grey"), or nothing ("none"): one shade."""
+    if left == "none":
+        return np.full_like(color, 150)
+    return np.stack([np.repeat(cv2.cvtColor(c, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2) for c in color])
 
 
 def judge(film: tuple[Film, int], seed: int, method: str, weights: Path | None) -> dict[str, Any]:

@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.instances.geometric.cloud import Cloud
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import group
 from list3r.instances.learned.graph import PieceGraph, Surroundings, chunk_surface
 from list3r.instances.learned.network import classify
 from list3r.instances.learned.pieces import Pieces, cut_pieces
+from list3r.instances.settings import SegmentSettings
+from training.colours import in_few_colours
 from training.samples import Sample, read_sample
 from training.worlds.catalogue import LABELS
 
@@ -64,33 +67,42 @@ def lesson_of(sample: Sample, graph: PieceGraph, labels: NDArray[np.int32], trut
     return Lesson(sample.seed, graph, thing, structure, np.array(name, np.int64), size.astype(np.float32))
 
 
-def first_lesson(path: Path) -> tuple[Lesson, NDArray[np.int32]]:
+def sample_and_cloud(path: Path, *, few: bool = False) -> tuple[Sample, Cloud]:
+    """Return a sample on disk, in few colours if so asked, and its cloud on the voxels that discovery has for it."""
+    sample = read_sample(path)
+    if few:
+        sample = in_few_colours(sample)
+    return sample, sample.cloud(SegmentSettings().grain_m(sensed=not sample.computed))
+
+
+def first_lesson(path: Path, *, few: bool = False) -> tuple[Lesson, NDArray[np.int32]]:
     """Return the graph of the finest pieces of a sample on disk with its truth, and the piece of each voxel.
 
-    It is kept beside the sample.
+    With `few` the room is `in_few_colours`. It is kept beside the sample.
     """
-    kept = path.with_suffix(".graph")
+    kept = path.with_suffix(".few.graph" if few else ".graph")
     if not kept.exists():
-        sample = read_sample(path)
-        cloud = sample.cloud()
+        sample, cloud = sample_and_cloud(path, few=few)
         pieces = cut_pieces(chunk_surface(cloud, sample.views, surroundings_of(sample)))
         lesson = lesson_of(sample, pieces.graph, pieces.labels, sample.truth_of(cloud))
         _write(kept, lesson, pieces.labels)
     return _read(kept)
 
 
-def second_lessons(path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path, ends: Sequence[Ends]) -> list[Lesson]:
+def second_lessons(
+    path: Path, arrays: Mapping[str, NDArray[Any]], folder: Path, ends: Sequence[Ends], *, few: bool = False
+) -> list[Lesson]:
     """Return the graphs of the parts that the networks make of a sample on disk, with their truth; kept in `folder`.
 
     One for each of `ends`: mean log odds down to which pieces are joined by the first network, and, one step after the
     other, parts by the second. So the second network learns from what it will see.
     """
-    files = [folder / f"{path.stem}-{'-'.join(f'{e:g}' for e in end)}.parts" for end in ends]
+    stem = f"{path.stem}-few" if few else path.stem
+    files = [folder / f"{stem}-{'-'.join(f'{e:g}' for e in end)}.parts" for end in ends]
     if not all(f.exists() for f in files):
         folder.mkdir(parents=True, exist_ok=True)
-        lesson, labels = first_lesson(path)
-        sample = read_sample(path)
-        cloud = sample.cloud()
+        lesson, labels = first_lesson(path, few=few)
+        sample, cloud = sample_and_cloud(path, few=few)
         truth = sample.truth_of(cloud)
         pieces, g = Pieces(labels, lesson.graph), lesson.graph
         surface = chunk_surface(cloud, sample.views, surroundings_of(sample))

@@ -78,8 +78,12 @@ def train(
     start: Path | None = None,
     without: str | None = None,
 ) -> None:
-    """Train both networks and the classifier of things on chunks, and write the weights."""
-    lessons, seen = [first_lesson(p)[0] for p in paths], [first_lesson(p)[0] for p in held]
+    """Train both networks and the classifier of things on chunks, and write the weights.
+
+    Every room is learned from as it is and in few colours.
+    """
+    rooms, left_out = ([(p, few) for p in of for few in (False, True)] for of in (paths, held))
+    lessons, seen = ([first_lesson(p, few=few)[0] for p, few in of] for of in (rooms, left_out))
     blind = ABLATIONS[without] if without else SEEING
     depth = 3 if blind.messages else 0
     fine = PieceNetwork(NODE_FEATURES, EDGE_FEATURES, len(LABELS), node=WIDTH, edge=EDGE_WIDTH, depth=depth)
@@ -87,14 +91,14 @@ def train(
         epochs, start=start and start / "fine", blind=blind, blink=0.1, average=AVERAGE, least_weight=1.0
     )
     arrays = named("fine", fit(fine, lessons, seen, out / "fine", settings))
-    every = [second_lessons(p, arrays, out / "parts", FIRST_ENDS) for p in paths]
-    unseen = [second_lessons(p, arrays, out / "parts", FIRST_ENDS[:1])[0] for p in held]
+    every = [second_lessons(p, arrays, out / "parts", FIRST_ENDS, few=few) for p, few in rooms]
+    unseen = [second_lessons(p, arrays, out / "parts", FIRST_ENDS[:1], few=few)[0] for p, few in left_out]
     settings = replace(settings, epochs=max(1, epochs // 2), start=None, noise=0.15, decay=1e-2, blink=0.15)
     first = [lesson for rows in every for lesson in rows]
     arrays |= named("coarse", fit(_second(blind), first, unseen, out / "coarse", settings))
-    for k, p in enumerate(paths):
-        every[k] += second_lessons(p, arrays, out / "parts", STATES)
-    unseen = [second_lessons(p, arrays, out / "parts", STATES)[-1] for p in held]
+    for k, (p, few) in enumerate(rooms):
+        every[k] += second_lessons(p, arrays, out / "parts", STATES, few=few)
+    unseen = [second_lessons(p, arrays, out / "parts", STATES, few=few)[-1] for p, few in left_out]
     settings = replace(settings, epochs=max(1, epochs - 2))
     network = fit(_second(blind), [lesson for rows in every for lesson in rows], unseen, out / "states", settings)
     arrays |= named("coarse", network)
