@@ -188,10 +188,14 @@ def discovery() -> str:
     ablation of the networks' inputs.
     """
     methods = {"geometric": "rules (removed since)", "learned": "learned (default)", "true": "true masks"}
+    methods["before"] = "learned, with the weights before decision 0179"
     places = {
         "discovery": "10 held-out worlds",
         "discovery-fitted": "6 held-out rooms with built-in furniture",
         "discovery-house": "house modelled by others",
+        "discovery-grey": "10 held-out worlds, grey pictures",
+        "discovery-no-colour": "10 held-out worlds, pictures of one shade",
+        "discovery-house-grey": "the house, grey pictures",
         "discovery-ablation": "the 10 worlds, trained on only 40 rooms",
     }
     keys = {"boxes at IoU 0.25": ("", "0.25"), "at 0.5": ("", "0.5"), "masks at 0.25": ("mask_", "0.25")}
