@@ -135,7 +135,7 @@ def proposed(discoverer: LearnedDiscoverer, chunk: Chunk, labels: Labels, flat: 
 
 def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np.bool_]]]:
     """Cluster of each voxel (N,), -1 for none, and which clusters are structure, of each rung."""
-    weights, surface, s = load_weights(file), chunk.surface, CutSettings()
+    weights, surface, s = load_weights(file, sensed=not chunk.surface.around.computed), chunk.surface, CutSettings()
     out = {"voxels": named(chunk, np.where(chunk.truth > 0, chunk.truth, -1))}
     out["superpoints"] = named(chunk, majority(chunk, cut_superpoints(surface).labels))
     pieces = cut_pieces(surface)

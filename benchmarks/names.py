@@ -186,7 +186,7 @@ def _calls(label: str) -> frozenset[str]:
 
 def listed(sample: Sample) -> dict[str, NDArray[Any]]:
     """Features and verdicts of the things of a chunk, and what each fits best by voxels and how well."""
-    weights = load_weights()
+    weights = load_weights(sensed=not sample.computed)
     cloud = sample.cloud(SegmentSettings().grain_m(sensed=not sample.computed))
     truth = sample.truth_of(cloud).astype(np.int64)
     surface = chunk_surface(cloud, sample.views, surroundings_of(sample))

@@ -201,7 +201,8 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
     if found.discovery == "learned":
         from list3r.instances.learned.weights import load_weights
 
-        load_weights()
+        for sensed in (True, False):
+            load_weights(sensed=sensed)
     return found
 
 

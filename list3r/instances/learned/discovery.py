@@ -19,7 +19,6 @@ from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
 from list3r.instances.learned.depth_errors import DepthErrorSettings, voxel_doubt, without_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
-from list3r.instances.learned.network import Weights
 from list3r.instances.learned.things import ThingVerdicts, names_of
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
@@ -64,7 +63,7 @@ class LearnedDiscoverer(CloudDiscoverer):
     ) -> None:
         super().__init__(settings)
         self._learned = learned or LearnedSettings()
-        self._weights: Weights = load_weights(weights)
+        self._weights = {sensed: load_weights(weights, sensed=sensed) for sensed in (True, False)}
         self._scraps: tuple[Segmentation, Features] | None = None
 
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
@@ -78,6 +77,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         shown = [views.view(p) for p in views.anchors]
         computed = views.reconstruction.depth_noise is not None
         sensed = not computed and views.reconstruction.scale_kind == "metric"
+        weights = self._weights[sensed]
         cloud = build_cloud(shown, settings.grain_m(sensed=sensed) * views.unit)
         poses = views.reconstruction.T_chunk_cam[views.reconstruction.posed]
         planes = find_planes(cloud, self._learned.plane_area_m2 * views.unit**2, views.unit)
@@ -88,12 +88,12 @@ class LearnedDiscoverer(CloudDiscoverer):
             return cloud, Segmentation(np.zeros(0, np.int32), (), up), np.zeros((0, 64), np.float32)
         around = Surroundings(up, views.unit, height, computed)
         surface = chunk_surface(cloud, shown, around)
-        cut = cut_cloud(surface, self._weights, self._learned.cut)
+        cut = cut_cloud(surface, weights, self._learned.cut)
         if around.computed:
             cut = self._as_sure_as_depth(views, surface, cut, planes)
         listed = (cut.verdicts.whole >= self._learned.least_confidence) | (cut.verdicts.structure > 0.5)
         parted = _walls_apart(cloud, cut.only(listed), planes)
-        names = names_of(self._weights)
+        names = names_of(weights)
         kept, features = _described(cloud, parted, up, views.unit, names)
         scraps = cut.only(~listed & (cut.verdicts.whole >= self._learned.least_scrap))
         self._scraps = _described(cloud, scraps, up, views.unit, names)

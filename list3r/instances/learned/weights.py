@@ -16,6 +16,8 @@ from list3r.memory.errors import OptionError
 VERSION = 3
 """Of the features and layers that weights belong to; others are refused."""
 SHIPPED = Path(__file__).with_name("weights.npz")
+COMPUTED = Path(__file__).with_name("weights-computed.npz")
+"""Shipped for depth that was computed: those that learned from few colours, too, are worse there (decision 0179)."""
 
 Float = NDArray[np.float32]
 
@@ -26,10 +28,13 @@ def write_weights(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None
     np.savez_compressed(path, version=np.int64(VERSION), checksum=np.array(_checksum(packed)), **packed)  # type: ignore[arg-type]
 
 
-@lru_cache(maxsize=2)
-def load_weights(path: Path | None = None) -> Mapping[str, Float]:
-    """Return the weights of a file, by default the shipped ones. Raises `OptionError` for what is wrong with it."""
-    file = path or SHIPPED
+@lru_cache(maxsize=4)
+def load_weights(path: Path | None = None, *, sensed: bool = True) -> Mapping[str, Float]:
+    """Return the weights of a file, by default the shipped ones, for depth that a sensor measured or that was computed.
+
+    Raises `OptionError` for what is wrong with the file.
+    """
+    file = path or (SHIPPED if sensed else COMPUTED)
     fix = "make it again with training/train.py" if path else "install list3r again"
     try:
         with np.load(file, allow_pickle=False) as data:
