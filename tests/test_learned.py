@@ -24,7 +24,7 @@ from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGr
 from list3r.instances.learned.network import Classification, classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
-from list3r.instances.learned.weights import SHIPPED, load_weights, write_weights
+from list3r.instances.learned.weights import COMPUTED, SHIPPED, load_weights, write_weights
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings, SegmentSettings
 from list3r.memory.errors import OptionError
@@ -115,9 +115,10 @@ def test_weights_come_back_and_damage_is_said(tmp_path: Path) -> None:
 
 
 def test_shipped_weights_are_small_and_whole() -> None:
-    assert SHIPPED.stat().st_size < 4_000_000
-    weights = load_weights()
-    assert weights["fine.node_mean"].shape == (NODE_FEATURES,) and weights["fine.edge_mean"].shape == (EDGE_FEATURES,)
+    assert SHIPPED.stat().st_size + COMPUTED.stat().st_size < 4_000_000
+    for weights in (load_weights(), load_weights(sensed=False)):
+        assert weights["fine.node_mean"].shape == (NODE_FEATURES,)
+        assert weights["fine.edge_mean"].shape == (EDGE_FEATURES,)
 
 
 def test_verdicts_on_things_are_probabilities_whatever_the_order_of_things() -> None:
@@ -145,13 +146,16 @@ def test_it_is_asked_for_by_name() -> None:
     assert isinstance(found, LearnedDiscoverer)
 
 
-def test_it_is_the_default_and_damage_to_its_weights_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("which", ["SHIPPED", "COMPUTED"])
+def test_it_is_the_default_and_damage_to_its_weights_is_said(
+    which: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
     assert settings_asked(BuildRequest(), depth, "any")[0].discovery == "learned"
     assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "learned"
     assert settings_asked(BuildRequest(discovery="eomt"), depth, "any")[0].discovery == "eomt"
     load_weights.cache_clear()
-    monkeypatch.setattr("list3r.instances.learned.weights.SHIPPED", tmp_path / "weights.npz")
+    monkeypatch.setattr(f"list3r.instances.learned.weights.{which}", tmp_path / "weights.npz")
     with pytest.raises(OptionError, match=r"weights\.npz") as said:
         settings_asked(BuildRequest(), depth, "any")
     assert "\n" not in str(said.value)

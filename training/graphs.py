@@ -80,7 +80,7 @@ def first_lesson(path: Path, *, few: bool = False) -> tuple[Lesson, NDArray[np.i
 
     With `few` the room is `in_few_colours`. It is kept beside the sample.
     """
-    kept = path.with_suffix(".few.graph" if few else ".graph")
+    kept = path.with_suffix(f".{_kind(few)}.graph")
     if not kept.exists():
         sample, cloud = sample_and_cloud(path, few=few)
         pieces = cut_pieces(chunk_surface(cloud, sample.views, surroundings_of(sample)))
@@ -97,8 +97,7 @@ def second_lessons(
     One for each of `ends`: mean log odds down to which pieces are joined by the first network, and, one step after the
     other, parts by the second. So the second network learns from what it will see.
     """
-    stem = f"{path.stem}-few" if few else path.stem
-    files = [folder / f"{stem}-{'-'.join(f'{e:g}' for e in end)}.parts" for end in ends]
+    files = [folder / f"{path.stem}-{_kind(few)}-{'-'.join(f'{e:g}' for e in end)}.parts" for end in ends]
     if not all(f.exists() for f in files):
         folder.mkdir(parents=True, exist_ok=True)
         lesson, labels = first_lesson(path, few=few)
@@ -122,6 +121,11 @@ def second_lessons(
             _, parts, graph = made[end]
             _write(file, lesson_of(sample, graph, parts, truth), np.zeros(0, np.int32))
     return [_read(f)[0] for f in files]
+
+
+def _kind(few: bool) -> str:
+    """Part of the names of kept graphs; those of 1 cm, which had none, are not read any more."""
+    return "few" if few else "plain"
 
 
 def _write(path: Path, lesson: Lesson, labels: NDArray[np.int32]) -> None:
