@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import platform
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -39,7 +41,11 @@ def run_list3r(*arguments: str, kept: Path | None = None) -> tuple[dict[str, Any
     program = ["-m", "list3r"] if kept is None else [str(Path(__file__).with_name("kept.py"))]
     environment = os.environ if kept is None else os.environ | {"LIST3R_KEPT": str(kept)}
     process = subprocess.Popen(
-        [sys.executable, *program, *arguments, "--json"], stdout=subprocess.PIPE, text=True, env=environment
+        [sys.executable, *program, *arguments, "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+        preexec_fn=_end_with_starter,
     )
     peak = _watch(process)
     out = process.stdout.read() if process.stdout else ""
@@ -47,6 +53,12 @@ def run_list3r(*arguments: str, kept: Path | None = None) -> tuple[dict[str, Any
         raise SystemExit(f"list3r {' '.join(arguments)} ended with status {process.returncode}")
     (report,) = json.loads(out)["matches"]
     return report, {"wall_s": round(time.monotonic() - started, 2), "peak_mb": round(peak / 1e6, 1)}
+
+
+def _end_with_starter() -> None:
+    """Let this process be told to end when the one that started it does, however that ends; on Linux."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG of <sys/prctl.h>
 
 
 def _watch(process: subprocess.Popen[str]) -> float:

@@ -56,3 +56,19 @@ def test_processes_of_a_benchmark_end_with_it(tmp_path: Path) -> None:
     process.terminate()
     process.communicate(timeout=60)
     assert until(lambda: not alive(worker))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel tells it there alone")
+def test_the_program_that_a_benchmark_runs_ends_with_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import sys\nsys.path[:0] = [{str(FOLDER)!r}, {str(FOLDER.parent)!r}]\n"
+        "import machine\nmachine._watch = lambda process: print(process.pid, flush=True) or process.wait()\n"
+        f"machine.run_list3r('demo', '--out', {str(tmp_path / 'demo')!r})\n"
+    )
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    program = int(process.stdout.readline())
+    process.kill()
+    process.communicate(timeout=60)
+    assert until(lambda: not alive(program))
