@@ -157,3 +157,42 @@ def extremes(own: Codes, values: NDArray[np.float64], count: int) -> tuple[NDArr
     for k in range(len(own)):
         low[own[k]], high[own[k]] = min(low[own[k]], values[k]), max(high[own[k]], values[k])
     return low, high
+
+
+@compiled
+def beyond_planes(
+    centers: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    cells: NDArray[np.float64],
+    facing: NDArray[np.float64],
+    limits: tuple[float, float],
+) -> NDArray[np.float64]:
+    """What lies around each of P planes, see `beyond`. Shape (P, 4).
+
+    `centers` and `normals` (P, 3) are those of the planes, `reach` (P,) how far around in the plane is looked; `cells`
+    and their normals `facing` have shape (C, 3). `limits`: how far a cell in a plane lies off it, and the farthest.
+    """
+    level, deep = limits
+    out = np.zeros((len(centers), 4))
+    for p in range(len(centers)):
+        around, behind, before, same, hidden, depth = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        x, y, z = normals[p]
+        for c in range(len(cells)):
+            a, b, d = cells[c, 0] - centers[p, 0], cells[c, 1] - centers[p, 1], cells[c, 2] - centers[p, 2]
+            off = a * x + b * y + d * z
+            if abs(off) > deep or a * a + b * b + d * d - off * off > reach[p] * reach[p]:
+                continue
+            alike = facing[c, 0] * x + facing[c, 1] * y + facing[c, 2] * z > 0.8
+            around += 1.0
+            if off > level:
+                before += 1.0
+            elif off >= -level:
+                same += alike
+            else:
+                behind += 1.0
+                if alike:
+                    hidden, depth = hidden + 1.0, depth - off
+        out[p, 0], out[p, 3] = behind / max(around, 1.0), before / max(around, 1.0)
+        out[p, 1], out[p, 2] = hidden / max(hidden + same, 1.0), depth / max(hidden, 1.0)
+    return out
