@@ -123,6 +123,8 @@ def test_chunks_are_those_of_a_plan_once_all_is_there() -> None:
     for count in range(1, 61):
         spans = ready_spans(FeedState(count, tuple(c for c in cuts if c < count), False), settings)
         assert spans[: len(seen)] == seen
+        ended = FeedState(count, tuple(c for c in cuts if c < count), True, waiting=60 - count)
+        assert count == 60 or ready_spans(ended, settings) == spans  # what waits when it ends still comes
         seen = list(spans)
     assert ready_spans(FeedState(60, cuts, True), settings) == whole
     assert seen == whole[: len(seen)] and len(seen) >= len(whole) - 1

@@ -101,9 +101,9 @@ def is_live(source: str | Path, run: RunOptions) -> bool:
 
 
 def ready_spans(state: FeedState, settings: ChunkSettings) -> list[ChunkSpan]:
-    """Return the chunks that later frames no longer change, in order."""
+    """Return the chunks that later frames no longer change, in order; those that wait come later, too."""
     spans = plan_chunks(state.count, settings, state.cuts)
-    if state.ended or not spans:
+    if (state.ended and not state.waiting) or not spans:
         return spans
     last_shot = max((c for c in state.cuts if c < state.count), default=0)
     return [s for s in spans if s.start < last_shot or s.stop - s.start == settings.length]
