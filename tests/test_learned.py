@@ -18,17 +18,9 @@ from list3r.instances.geometric.views import chunk_views, forget_views, working_
 from list3r.instances.learned import discovery
 from list3r.instances.learned import graph as graphs
 from list3r.instances.learned.agglomeration import agglomerate
-from list3r.instances.learned.beyond import beyond
 from list3r.instances.learned.cut import CloudCut, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
-from list3r.instances.learned.graph import (
-    EDGE_FEATURES,
-    NODE_FEATURES,
-    PieceGraph,
-    Surroundings,
-    chunk_surface,
-    piece_graph,
-)
+from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph, Surroundings, chunk_surface
 from list3r.instances.learned.network import Classification, classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
@@ -274,35 +266,6 @@ def test_both_sides_of_a_thin_wall_are_one() -> None:
     (plane,) = find_planes(cloud, 0.03, 1.0)
     parted = _walls_apart(cloud, cut, [plane, replace(plane, equation=-plane.equation)])
     assert len(parted.verdicts.structure) == 1 and set(parted.labels.tolist()) == {0}
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.7])
-@pytest.mark.parametrize("unit", [1.0, 0.3])
-def test_a_wall_has_nothing_behind_it_and_a_shelf_before_it_has_the_wall(turn: float, unit: float) -> None:
-    """A wall of 3 x 2.4 m, the front of a shelf of 1 x 2 m that stands 0.3 m before it, and the floor."""
-    grid = lambda wide, tall: np.stack(  # noqa: E731
-        np.meshgrid(np.arange(0, wide, 0.01), np.arange(0, tall, 0.01)), axis=-1
-    ).reshape(-1, 2)
-    wall, shelf, floor = grid(3.0, 2.4), grid(1.0, 2.0), grid(3.0, 2.0)
-    wall = wall[~((wall[:, 0] < 2.0) & (wall[:, 0] > 1.0) & (wall[:, 1] < 2.0))]
-    points = [
-        np.column_stack([wall[:, 0], np.zeros(len(wall)), wall[:, 1]]),
-        np.column_stack([1.0 + shelf[:, 0], np.full(len(shelf), 0.3), shelf[:, 1]]),
-        np.column_stack([floor, np.zeros(len(floor))]),
-    ]
-    own = np.repeat(np.arange(3, dtype=np.int32), [len(p) for p in points])
-    way = np.repeat(np.array([[0.0, 1, 0], [0, 1, 0], [0, 0, 1]]), [len(p) for p in points], axis=0)
-    R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    every = ((np.concatenate(points) + 0.005) @ R.T * unit).astype(np.float32)
-    row = np.random.default_rng(1).permutation(len(every))
-    cloud = replace(cloud_of(every[row], (way[row] @ R.T).astype(np.float32)), voxel=0.01 * unit)
-    same = {p.tobytes(): o for p, o in zip(every, own, strict=True)}
-    labels = np.array([same[p.tobytes()] for p in cloud.points], np.int32)
-    surface = chunk_surface(cloud, (), Surroundings(np.array([0.0, 0.0, 1.0]), unit, 1.4 * unit, False))
-    behind, hidden, depth, before = beyond(surface, labels, piece_graph(surface, labels)).T
-    assert behind[0] == behind[2] == hidden[0] == hidden[2] == 0.0
-    assert behind[1] > 0.2 and hidden[1] > 0.3 and depth[1] == pytest.approx(0.3, abs=0.03)
-    assert before[0] > before[1] and before[2] > 0.2
 
 
 def cloud_of(points: np.ndarray, normals: np.ndarray) -> Cloud:

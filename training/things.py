@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import functional as F
 
 from list3r.instances.learned.agglomeration import agglomerate
@@ -42,8 +42,6 @@ class ThingFit:
     noise: float = 0.1
     """Deviation of what is added to features, of their own deviation."""
     dropout: float = 0.5
-    members: int = 4
-    """Networks of other seeds whose mean is taken: one alone tells places unlike its lessons now better, now worse."""
     seed: int = 0
 
 
@@ -114,42 +112,26 @@ def fit_things(
     blind: Blindness = SEEING,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of the classifier of things, trained on `lessons` and calibrated on left-out worlds."""
+    s = settings or ThingFit()
     table = table_of(arrays, lessons, more=True)
-    found = fit_table(table, settings or ThingFit(), blind)
-    found["names"] = np.array(LABELS)
-    return found | calibrate({**arrays, **found}, held)
-
-
-def fit_table(table: ThingTable, s: ThingFit, blind: Blindness = SEEING) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the classifier of things, not calibrated: the mean of networks of several seeds, as one."""
     free = ~table.structure
     x, whole, name = table.x[free], table.whole[free], table.name[free]
     mean, std = x.mean(axis=0), x.std(axis=0) + 1e-2
     std[[NODES_AT + k for k, column in enumerate(SHOWN_NODES) if column in blind.nodes]] = BLIND
-    given, truth = torch.from_numpy((x - mean) / std), torch.from_numpy(whole.astype(np.float32))
-    nets = [_fit_one(given, truth, torch.from_numpy(name), s, s.seed + k) for k in range(s.members)]
-    (first, last), count = zip(*nets, strict=True), float(s.members)
-    found: dict[str, NDArray[Any]] = {"things.mean": mean, "things.std": std}
-    found["things.net.0.weight"] = torch.cat([n.weight for n in first]).detach().numpy()
-    found["things.net.0.bias"] = torch.cat([n.bias for n in first]).detach().numpy()
-    found["things.net.2.weight"] = (torch.cat([n.weight for n in last], dim=1) / count).detach().numpy()
-    found["things.net.2.bias"] = (torch.stack([n.bias for n in last]).mean(dim=0)).detach().numpy()
-    return found
-
-
-def _fit_one(given: Tensor, truth: Tensor, called: Tensor, s: ThingFit, seed: int) -> tuple[nn.Linear, nn.Linear]:
-    """Return both layers of a network that was trained on features (T, F), wholeness (T,) and names (T,)."""
-    torch.manual_seed(seed)
-    first, last = nn.Linear(given.shape[1], s.hidden), nn.Linear(s.hidden, 1 + len(LABELS))
-    net = nn.Sequential(first, nn.ReLU(), nn.Dropout(s.dropout), last)
+    torch.manual_seed(s.seed)
+    net = nn.Sequential(
+        nn.Linear(x.shape[1], s.hidden), nn.ReLU(), nn.Dropout(s.dropout), nn.Linear(s.hidden, 1 + len(LABELS))
+    )
     optimiser = torch.optim.AdamW(net.parameters(), s.rate, weight_decay=s.decay)
-    share = torch.from_numpy(1.0 / np.sqrt(np.bincount(called[called >= 0], minlength=len(LABELS)) + 5.0)).float()
-    rng = np.random.default_rng(seed)
+    given, truth = torch.from_numpy((x - mean) / std), torch.from_numpy(whole.astype(np.float32))
+    called = torch.from_numpy(name)
+    share = torch.from_numpy(1.0 / np.sqrt(np.bincount(name[name >= 0], minlength=len(LABELS)) + 5.0)).float()
+    rng = np.random.default_rng(s.seed)
     for step in range(s.steps):
-        rows = torch.from_numpy(rng.integers(len(given), size=s.batch))
+        rows = torch.from_numpy(rng.integers(len(x), size=s.batch))
         for group in optimiser.param_groups:
             group["lr"] = s.rate * 0.5 * (1 + float(np.cos(np.pi * step / s.steps)))
-        out = net(given[rows] + s.noise * torch.randn(len(rows), given.shape[1]))
+        out = net(given[rows] + s.noise * torch.randn(len(rows), x.shape[1]))
         loss = F.binary_cross_entropy_with_logits(out[:, 0], truth[rows])
         known = called[rows] >= 0
         if known.any():
@@ -159,7 +141,13 @@ def _fit_one(given: Tensor, truth: Tensor, called: Tensor, s: ThingFit, seed: in
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return first, last
+    layers = {"0": net[0], "2": net[3]}
+    found: dict[str, NDArray[Any]] = {"things.mean": mean, "things.std": std}
+    for number, layer in layers.items():
+        found[f"things.net.{number}.weight"] = layer.weight.detach().numpy()
+        found[f"things.net.{number}.bias"] = layer.bias.detach().numpy()
+    found["names"] = np.array(LABELS)
+    return found | calibrate({**arrays, **found}, held)
 
 
 def calibrate(arrays: Arrays, held: Sequence[Lesson]) -> dict[str, NDArray[Any]]:

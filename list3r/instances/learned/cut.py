@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from list3r.instances.learned.agglomeration import STRONGEST, agglomerate
-from list3r.instances.learned.beyond import BEYOND, beyond
 from list3r.instances.learned.graph import ChunkSurface, PieceGraph, piece_graph
 from list3r.instances.learned.network import Classification, Weights, classify
 from list3r.instances.learned.pieces import Pieces, cut_pieces
@@ -119,7 +118,7 @@ def group(
         [np.bincount(own, said[:, k] * size, minlength=count) / total for k in range(said.shape[1])], axis=1
     )
     amount = np.log(np.bincount(own, minlength=count))[:, None]
-    nodes = np.concatenate([graph.nodes, mean, amount, beyond(surface, labels, graph)], axis=1)
+    nodes = np.concatenate([graph.nodes, mean, amount], axis=1)
     edges = np.concatenate([graph.edges, _told_between(g, told, own, graph)], axis=1)
     return labels, replace(graph, nodes=nodes.astype(np.float32), edges=edges.astype(np.float32))
 
@@ -127,9 +126,9 @@ def group(
 FAR = 3
 """Doublings of the voxel's size at which parts are neighbours: legs end up to 16 cm below what they carry, where a view
 from above hides their top."""
-EXTRA_NODES = 2 + BEYOND
-"""Columns that `group` adds to the features of pieces besides those of the first network's hidden state: structure,
-number of pieces, and what lies `beyond` them."""
+EXTRA_NODES = 2
+"""Columns that `group` adds to the features of pieces besides those of the first network's hidden state: structure and
+number of pieces."""
 EXTRA_EDGES = 4
 
 

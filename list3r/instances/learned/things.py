@@ -16,9 +16,8 @@ from list3r.instances.learned.network import Classification, Weights, two_layers
 Float = NDArray[np.float32]
 
 
-SHOWN_NODES = (2, 3, 4, *range(16, 26), -4, -3, -2, -1)
-"""Columns of the features of parts whose means verdicts are told from: slopes, colours, noise, what is before it; and
-what lies beyond it."""
+SHOWN_NODES = (2, 3, 4, *range(16, 26))
+"""Columns of the features of parts whose means verdicts are told from: slopes, colours, noise, what is before it."""
 NODES_AT = 19
 """Column of the first of them among the features of things."""
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.errors import OptionError
 
-VERSION = 4
+VERSION = 3
 """Of the features and layers that weights belong to; others are refused."""
 SHIPPED = Path(__file__).with_name("weights.npz")
 COMPUTED = Path(__file__).with_name("weights-computed.npz")
