@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -38,37 +39,38 @@ def test_there_are_benchmarks() -> None:
     assert {"safety", "scale", "association", "pose_graph"} <= set(PROGRAMS)
 
 
-def test_processes_of_a_benchmark_end_with_it(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(
-        f"import sys, time\nsys.path[:0] = [{str(FOLDER)!r}, {str(FOLDER.parent)!r}]\n"
-        "from concurrent.futures import ProcessPoolExecutor\nimport multiprocessing, os\n"
-        "from machine import end_with_parent\n"
-        "if __name__ == '__main__':\n"
-        "    spawn = multiprocessing.get_context('spawn')\n"
-        "    with ProcessPoolExecutor(1, mp_context=spawn, initializer=end_with_parent) as pool:\n"
-        "        print(pool.submit(os.getpid).result(), flush=True)\n"
-        "        pool.submit(time.sleep, 60).result()\n"
-    )
-    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    worker = int(process.stdout.readline())
-    process.terminate()
-    process.communicate(timeout=60)
-    assert until(lambda: not alive(worker))
+WORKER = """
+from concurrent.futures import ProcessPoolExecutor
+import multiprocessing, os, time
+from machine import end_with_parent
+if __name__ == "__main__":
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn, initializer=end_with_parent) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        pool.submit(time.sleep, 60).result()
+"""
+PROGRAM = """
+import machine
+machine._watch = lambda process: print(process.pid, flush=True) or process.wait()
+machine.run_list3r("demo", "--out", sys.argv[1])
+"""
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the kernel tells it there alone")
-def test_the_program_that_a_benchmark_runs_ends_with_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        WORKER,
+        pytest.param(PROGRAM, marks=pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's prctl")),
+    ],
+    ids=["worker", "program"],
+)
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_what_a_benchmark_starts_ends_with_it(text: str, how: signal.Signals, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
-    script.write_text(
-        f"import sys\nsys.path[:0] = [{str(FOLDER)!r}, {str(FOLDER.parent)!r}]\n"
-        "import machine\nmachine._watch = lambda process: print(process.pid, flush=True) or process.wait()\n"
-        f"machine.run_list3r('demo', '--out', {str(tmp_path / 'demo')!r})\n"
-    )
-    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    script.write_text(f"import sys\nsys.path[:0] = [{str(FOLDER)!r}, {str(FOLDER.parent)!r}]\n{text}")
+    process = subprocess.Popen([sys.executable, str(script), str(tmp_path / "demo")], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    program = int(process.stdout.readline())
-    process.kill()
+    started = int(process.stdout.readline())
+    process.send_signal(how)
     process.communicate(timeout=60)
-    assert until(lambda: not alive(program))
+    assert until(lambda: not alive(started))
