@@ -11,15 +11,17 @@ import pytest
 
 import list3r
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
-from list3r.frames.source import SourceOptions
+from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
+from list3r.pipeline.chunks.calibration import estimated_camera
 from list3r.pipeline.chunks.chunk import PART_STEP, ChunkTask, process_parts
 from list3r.pipeline.precompute import precompute
 from list3r.pipeline.request import RunOptions, Watch
 from list3r.pipeline.settings import BuildSettings
+from list3r.pipeline.workers import OrderedPool
 from list3r.reconstruction.precomputed_files import read_piece
 from tests.rgbd_scenes import CAMERA, render
 
@@ -62,6 +64,19 @@ def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path)
     S = umeyama(found, truth, with_scale=True)
     assert np.sqrt((np.linalg.norm(S.apply(found) - truth, axis=1) ** 2).mean()) < 0.02
     assert list3r.open(memory) is not None
+
+
+def test_the_camera_is_the_same_wherever_its_windows_are_mapped(pictures: Path) -> None:
+    settings = BuildSettings("sfm", "estimate", device="cpu")
+    short = replace(settings.models.sfm.calibration, windows=3, frames=13, least_frames=13)
+    settings = replace(settings, models=replace(settings.models, sfm=replace(settings.models.sfm, calibration=short)))
+    told: list[tuple[str, int, int]] = []
+    with OrderedPool(process_parts, 2) as pool:
+        there = estimated_camera(
+            open_source(pictures), SourceOptions(), settings, lambda *said: told.append(said), pool=pool
+        )
+    assert told == [("camera", 1, 3), ("camera", 2, 3), ("camera", 3, 3)]
+    assert there is not None and there == estimated_camera(open_source(pictures), SourceOptions(), settings)
 
 
 def test_nothing_is_left_of_a_video_that_cannot_be_followed(tmp_path: Path):

@@ -54,7 +54,7 @@ def build(
     with open_target(memory, job.info, job.settings, resume=run.resume, force=run.force) as target:
         session = _session(target.store, job)
         with chunk_pool(job) as pool:
-            plan = plan_session(target.store, session, job, watch)
+            plan = plan_session(target.store, session, job, watch, pool)
             add_chunks(target.store, job, plan, pool, watch, partial(_keep, target))
         _check_posed(target.store, job.info, plan)
         with threadpool_limits(1):

@@ -154,8 +154,8 @@ def prepare(
     return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes), opened)
 
 
-def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
-    """The chunks of a session, and of those the ones that are not in the memory yet."""
+def plan_session(store: Store, session: int, job: Job, watch: Watch, pool: ChunkPool | None = None) -> Plan:
+    """The chunks of a session, and of those the ones that are not in the memory yet; a `pool` helps with the camera."""
     count = job.info.frame_count
     cuts = _cuts(store, session, job, watch)
     step = settled_step(store, session, job, watch)
@@ -164,7 +164,7 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
     wide = step == 1 and not cuts and takes_wide_steps(job.frames(), job.settings)
     shorter = map_spans(job.frames(), job.settings, spans, begun) if wide else spans
     left = next((s for s in shorter if s.index not in done), None)
-    options, whole = _camera_and_map(store, session, job, watch, wide and left is not None)
+    options, whole = _camera_and_map(store, session, job, watch, pool, wide=wide and left is not None)
     if whole is not None or left is None:
         spans = shorter
     left = next((s for s in spans if s.index not in done), None)
@@ -178,7 +178,7 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch) -> Plan:
 
 
 def _camera_and_map(
-    store: Store, session: int, job: Job, watch: Watch, wide: bool
+    store: Store, session: int, job: Job, watch: Watch, pool: ChunkPool | None, *, wide: bool
 ) -> tuple[SourceOptions, VideoMap | None]:
     """The options with the camera as it was estimated, and the map of a whole video of wide steps, which tells what is
     not known of a camera whose focal length is given.
@@ -186,7 +186,7 @@ def _camera_and_map(
     given = job.info.camera is not None
     whole = map_whole(job.frames(), job.settings) if wide and given else None
     how = with_short_windows(job.settings) if wide else job.settings
-    estimate = partial(estimated_camera, job.frames(), job.options, how, watch.look, whole)
+    estimate = partial(estimated_camera, job.frames(), job.options, how, watch.look, whole, pool)
     options = with_camera(store, session, job.options, estimate)
     if wide and not given:
         whole = map_whole(open_source(job.source, options), job.settings)

@@ -69,7 +69,7 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
         return plan_session(store, session, job, watch)
     try:
         with chunk_pool(job) as pool:
-            plan = plan_session(store, session, job, watch)
+            plan = plan_session(store, session, job, watch, pool)
             add_chunks(store, job, plan, pool, watch)
         _check_posed(store, session, job.info)
     except BaseException:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import FrameSource
+from list3r.frames.base import Camera, FrameSource
 from list3r.frames.options import SourceOptions
 from list3r.memory.records import SessionCamera
 from list3r.memory.store.store import Store
+from list3r.pipeline.chunks.chunk import open_once
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
 
 if TYPE_CHECKING:
     from list3r.association.whole_map.video_map import VideoMap
+    from list3r.pipeline.chunks.joint_windows import ChunkPool
 
 _SILENT_ON_DISTORTION = ("images", "video", "live")
 """Kinds of source that say nothing of their lens but what the user does."""
@@ -46,11 +48,12 @@ def estimated_camera(
     settings: BuildSettings,
     look: Callable[[str, int, int], None] | None = None,
     whole: VideoMap | None = None,
+    pool: ChunkPool | None = None,
 ) -> SessionCamera | None:
     """Return the camera of pictures as stored; None where the source or the model says it.
 
     `look` hears ("camera", windows of the video done, in all). Where the focal length is given and the `whole` video
-    is mapped, that map tells the rest.
+    is mapped, that map tells the rest. Windows are mapped by the processes of a `pool` where there is one.
     """
     name, info = entry(settings.reconstruction).calibration, source.info
     distortion_known = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
@@ -63,11 +66,38 @@ def estimated_camera(
         assert size is not None
         stored_px = max(size) / max(info.image_size or size)
         if whole is None:
-            found = module.calibrate(source, settings.models.sfm, progress, stored_px=stored_px)
+            first = CameraWindow(source.info.path, options, settings)
+            mapped = None if pool is None else (lambda spans, start: _mapped(pool, first, spans, start))
+            found = module.calibrate(source, settings.models.sfm, progress, stored_px, mapped)
         else:
             found = module.calibrate_by_map(info.camera, whole.keyframes, settings.models.sfm, stored_px)
     full = found.camera.resized(*size)
     return SessionCamera((full.fx, full.fy, full.cx, full.cy), tuple(found.camera.distortion), tuple(found.notes))
+
+
+@dataclass(frozen=True)
+class CameraWindow:
+    """A stretch of a video by which its camera is estimated."""
+
+    path: str
+    options: SourceOptions
+    settings: BuildSettings
+    span: tuple[int, int] = (0, 0)
+    """Positions [start, stop)."""
+    start: Camera | None = None
+    """The camera that its map begins with."""
+
+
+def map_camera_window(window: CameraWindow) -> Any:
+    """Return what the model's module makes of one window."""
+    module = import_module(f"list3r.reconstruction.{entry(window.settings.reconstruction).calibration}")
+    source = open_once(window.path, window.options)
+    return module.map_window(source, *window.span, window.start, window.settings.models.sfm)
+
+
+def _mapped(pool: ChunkPool, first: CameraWindow, spans: Sequence[tuple[int, int]], start: Camera) -> Iterable[Any]:
+    """Map some windows in the processes of a pool, in order."""
+    return pool.each(map_camera_window, (replace(first, span=span, start=start) for span in spans))
 
 
 def with_short_windows(settings: BuildSettings) -> BuildSettings:

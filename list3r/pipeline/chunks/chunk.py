@@ -63,7 +63,7 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     that the settings name.
     """
     clock = _Clock()
-    source = _source(task.path, task.options)
+    source = open_once(task.path, task.options)
     camera = source.info.camera or guessed_camera(source.info)
     read = _read(task, source)
     frames = [f for f in read if isinstance(f, Frame)]
@@ -326,7 +326,7 @@ class _JointModel:
         return reconstruct_jointly(self._made(), sides)
 
     def _made(self) -> Reconstructor:
-        known = _source(self._task.path, self._task.options).info.camera is not None
+        known = open_once(self._task.path, self._task.options).info.camera is not None
         return _model(replace(self._task.settings, poses="estimate"), known)
 
 
@@ -373,7 +373,8 @@ def _detector(settings: BuildSettings) -> LearnedDetector | None:
 
 
 @lru_cache(maxsize=2)
-def _source(path: str, options: SourceOptions) -> FrameSource:
+def open_once(path: str, options: SourceOptions) -> FrameSource:
+    """Return a source, listed once in a process."""
     return open_source(path, options)
 
 

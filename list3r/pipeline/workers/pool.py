@@ -76,7 +76,11 @@ class OrderedPool(Generic[Task, Result]):
 
         Raises what the function raised for a task, and `WorkerError` where a process was ended from outside.
         """
-        return in_order(tasks, lambda task: self._submit(self._work, task), self._outcome, self._workers + 1)
+        return self.each(self._work, tasks)
+
+    def each(self, work: Callable[[Question], Answer], questions: Iterable[Question]) -> Iterator[Answer]:
+        """Yield what another function makes of some arguments, in the way of `map`."""
+        return in_order(questions, lambda question: self._submit(work, question), self._outcome, self._workers + 1)
 
     def ask(self, work: Callable[[Question], Answer], question: Question) -> Answer:
         """Return what another function makes of its argument, after the tasks that are under way."""

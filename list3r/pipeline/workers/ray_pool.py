@@ -53,7 +53,11 @@ class RayPool(Generic[Task, Result]):
 
     def map(self, tasks: Iterable[Task]) -> Iterator[Result]:
         """Yield results in order. Raises what the function raised, and `WorkerError` where a machine was lost."""
-        return in_order(tasks, lambda task: self._submit(self._work, task), self._outcome, self._ahead)
+        return self.each(self._work, tasks)
+
+    def each(self, work: Callable[[Question], Answer], questions: Iterable[Question]) -> Iterator[Answer]:
+        """Yield what another function makes of some arguments, in the way of `map`."""
+        return in_order(questions, lambda question: self._submit(work, question), self._outcome, self._ahead)
 
     def ask(self, work: Callable[[Question], Answer], question: Question) -> Answer:
         """Return what another function makes of its argument."""

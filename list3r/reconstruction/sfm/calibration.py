@@ -6,7 +6,7 @@ for all. A window's parallax decides how much it says. All chunks use the camera
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -40,19 +40,22 @@ def calibrate(
     settings: SfmSettings | None = None,
     progress: Progress | None = None,
     stored_px: float = 1.0,
+    mapped: WindowMaps | None = None,
 ) -> CameraCalibration:
     """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given.
 
     `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes speak of those.
+    `mapped` maps the windows somewhere else, as in other processes, in the way of `map_window`.
     """
     sfm = settings or SfmSettings()
     chosen = sfm.calibration
     info = source.info
     known = info.camera is not None
     start = info.camera or guessed_camera(info)
-    found = _estimated(source, start, sfm, progress)
+    mapped = mapped or (lambda spans, camera: (map_window(source, *span, camera, sfm) for span in spans))
+    found = _estimated(source, start, chosen, mapped, progress)
     if found is None and known:
-        found = _estimated(source, guessed_camera(info), sfm, progress)
+        found = _estimated(source, guessed_camera(info), chosen, mapped, progress)
     if found is None:
         return _nothing(start, known, stored_px)
     windows, free, k1 = found.windows, found.camera, found.k1
@@ -98,6 +101,8 @@ def _px_text(camera: Camera, sigma: float, stored_px: float) -> str:
 
 
 _Windows = list[tuple[MapProblem, SparseMap]]
+WindowMaps = Callable[[Sequence[tuple[int, int]], Camera], Iterable[tuple[MapProblem, SparseMap] | None]]
+"""What maps windows, by their positions [start, stop), each from a camera to begin with."""
 Progress = Callable[[int, int], None]
 """Called with (windows done, in all)."""
 
@@ -116,15 +121,19 @@ class _Estimate:
     """Length of a window."""
 
 
-def _estimated(source: FrameSource, start: Camera, sfm: SfmSettings, progress: Progress | None) -> _Estimate | None:
+def _estimated(
+    source: FrameSource,
+    start: Camera,
+    settings: CameraCalibrationSettings,
+    mapped: WindowMaps,
+    progress: Progress | None,
+) -> _Estimate | None:
     """Return what is said by the windows that could be mapped and can be believed; None where they make no sense."""
-    settings = sfm.calibration
     windows, begins, spans = [], [], _spans(source.info.frame_count, settings)
-    for done, (a, b) in enumerate(spans, start=1):
-        window = _window(source, a, b, start, sfm)
+    for done, window in enumerate(mapped(spans, start), start=1):
         if window is not None and _believable(window[1].camera, window[1].k1, settings):
             windows.append(window)
-            begins.append(index_at(source, a))
+            begins.append(index_at(source, spans[done - 1][0]))
         if progress is not None:
             progress(done, len(spans))
     if not windows:
@@ -198,10 +207,10 @@ def _spans(count: int, settings: CameraCalibrationSettings) -> list[tuple[int, i
     return [(a, min(a + frames, count)) for a in starts]
 
 
-def _window(
+def map_window(
     source: FrameSource, start: int, stop: int, camera: Camera, settings: SfmSettings
 ) -> tuple[MapProblem, SparseMap] | None:
-    """Return the largest map of a window with a camera of its own."""
+    """Return the largest map of the frames at positions [start, stop), with a camera of its own; None without one."""
     frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
     if len(frames) < 2:
         return None
