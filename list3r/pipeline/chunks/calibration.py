@@ -104,9 +104,10 @@ def with_short_windows(settings: BuildSettings) -> BuildSettings:
     """Return settings by which the camera of a video of wide steps is estimated: from shorter windows, by maps that are
     adjusted less often."""
     s = settings.video_map
-    windows = replace(settings.models.sfm.calibration, windows=3, frames=s.window_frames, least_frames=s.window_frames)
-    mapping = replace(settings.models.sfm.mapping, growth=s.mapping.growth, whole_rounds=s.mapping.whole_rounds)
-    sfm = replace(settings.models.sfm, mapping=mapping, calibration=windows)
+    before = settings.models.sfm.calibration
+    mapping = replace(before.mapping, growth=s.mapping.growth, whole_rounds=s.mapping.whole_rounds)
+    windows = replace(before, windows=3, frames=s.window_frames, least_frames=s.window_frames, mapping=mapping)
+    sfm = replace(settings.models.sfm, calibration=windows)
     return replace(settings, models=replace(settings.models, sfm=sfm))
 
 

@@ -219,8 +219,7 @@ def map_window(
     if len(tracks.keyframes) < 3:
         return None
     problem = keyframe_problem(tracks, grays, settings.links)
-    long = replace(settings.mapping, settled=0.0)  # a focal length is told by the last of the error
-    maps = build_maps(problem, camera, free_camera="focal", settings=long)
+    maps = build_maps(problem, camera, free_camera="focal", settings=settings.calibration.mapping)
     return (problem, maps[0]) if maps and len(maps[0].T_map_cam) >= 3 else None
 
 

@@ -3,7 +3,7 @@
 Nothing touches the disk: the correspondences lie in a database in memory. pycolmap's pixels have their origin at the
 corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
 correspondences give the same structure. Growing a map is a local search, so maps are grown from pairs in up to three
-places of a chunk (decision 0064).
+places of a chunk (decision 0064), roughly, and the one that is kept is adjusted once it is whole (decision 0181).
 """
 
 from __future__ import annotations
@@ -100,17 +100,24 @@ def build_maps(
     cache = correspondences(problem, camera, free_camera, chosen, verified)
     if cache is None:
         return []
+    work = _Work(cache, problem, camera, free_camera, chosen)
     grown: list[list[SparseMap]] = []
+    models: dict[int, Any] = {}
     for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
-        maps = _grown(cache, problem, camera, free_camera, pair, chosen)
-        grown.append(_without_beside(maps, problem))
+        made = _grown(work, pair)
+        maps = [found for found, _ in made]
+        own = [(_without_beside(found, problem), model) for found, model in made]
+        own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _first_of_all(m[0]))
+        grown.append([found for found, _ in own])
+        models |= {id(found): model for found, model in own}
         if agreed(grown, chosen) or (maps and all(steady(m, chosen.steady) for m in maps)):
             break
-        if not maps and pair is None and _turns(problem, problem.views, camera, chosen):
+        if not maps and pair is None and work.only_turns(problem.views):
             break
     best = best_of(grown, chosen.alike)
     held = {key for found in best for key in found.T_map_cam}
-    return [*best, *(found for found in grown[0] if not held & found.T_map_cam.keys())]
+    kept = [*best, *(found for found in grown[0] if not held & found.T_map_cam.keys())]
+    return [_finished(work, found, models[id(found)]) for found in kept]
 
 
 def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[int, int]]:
@@ -127,45 +134,92 @@ def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[in
     return out
 
 
-def _grown(
-    cache: Any,
-    problem: MapProblem,
-    camera: Camera,
-    free_camera: str,
-    pair: tuple[int, int] | None,
-    settings: MappingSettings,
-) -> list[SparseMap]:
-    """Maps that grow from two keyframes, one from a given pair; none of a camera that only turns."""
-    options = mapper_options(camera, free_camera, settings)
-    given = pair is not None or free_camera == "focal"
+@dataclass(frozen=True)
+class _Work:
+    """What maps are grown of, and how."""
+
+    cache: Any
+    problem: MapProblem
+    camera: Camera
+    free_camera: str
+    settings: MappingSettings
+    turns: dict[frozenset[int], bool] = field(default_factory=dict)
+    """Whether the camera only turns in some of the views, as far as that was asked."""
+
+    def only_turns(self, keys: Collection[int]) -> bool:
+        """Return whether the camera only turns in some of the views."""
+        some = frozenset(keys)
+        if some not in self.turns:
+            places = {key: view.xy for key, view in self.problem.views.items()}
+            self.turns[some] = only_turns(places, self.problem.pairs, keys, self.camera, self.settings.turning)
+        return self.turns[some]
+
+
+def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, Any]]:
+    """Maps that grow from two keyframes, one from a given pair, each with pycolmap's own; none of a camera that only
+    turns.
+    """
+    settings = work.settings
+    options = mapper_options(work.camera, work.free_camera, settings)
+    if settings.rough_iterations:
+        options.ba_global_max_num_iterations = settings.rough_iterations
+        options.ba_global_max_refinements = 1
+    given = pair is not None or work.free_camera == "focal"
     options.mapper.init_min_tri_angle = settings.given_angle_deg if given else settings.first_angle_deg
     if pair is not None:
         options.init_image_id1, options.init_image_id2 = pair[0] + 1, pair[1] + 1
         options.max_num_models = 1
     manager = pycolmap.ReconstructionManager()
-    pycolmap.IncrementalPipeline(options, cache, manager).run()
-    maps = [sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
-    if problem.matched:
-        maps = [_borne_out(m, problem, cache, camera, settings) for m in maps]
-    maps = [m for m in maps if len(m.points) >= settings.least_points and len(m.T_map_cam) >= 2]
-    return [m for m in maps if not _turns(problem, m.T_map_cam, camera, settings)]
+    pycolmap.IncrementalPipeline(options, work.cache, manager).run()
+    models = [manager.get(k) for k in range(manager.size())]
+    maps = [(m, model) for m, model in ((_map_of(work, model), model) for model in models) if _enough(m, settings)]
+    return [(m, model) for m, model in maps if not work.only_turns(m.T_map_cam)]
 
 
-def _turns(problem: MapProblem, keys: Collection[int], camera: Camera, settings: MappingSettings) -> bool:
-    """Return whether the camera only turns in some of the views."""
-    places = {key: view.xy for key, view in problem.views.items()}
-    return only_turns(places, problem.pairs, keys, camera, settings.turning)
+def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
+    """Return a map that was grown roughly, adjusted as a whole; as it is where too little would be left of it."""
+    settings = work.settings
+    if not settings.rough_iterations:
+        return found
+    options = mapper_options(work.camera, work.free_camera, settings)
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.refine_focal_length = options.ba_refine_focal_length
+    adjustment.refine_extra_params = options.ba_refine_extra_params
+    adjustment.print_summary = False
+    solver = adjustment.ceres.solver_options
+    solver.num_threads, solver.max_num_iterations = 1, settings.whole_iterations
+    solver.function_tolerance = settings.settled
+    mapper = pycolmap.IncrementalMapper(work.cache)
+    mapper.begin_reconstruction(model)
+    change = options.ba_global_max_refinement_change
+    mapper.iterative_global_refinement(settings.whole_rounds, change, options.mapper, adjustment, options.triangulation)
+    mapper.end_reconstruction(False)
+    whole = _map_of(work, model)
+    own = _without_beside(whole, work.problem)
+    return own if _enough(whole, settings) and len(own.T_map_cam) >= 2 else found
 
 
-def _without_beside(maps: Sequence[SparseMap], problem: MapProblem) -> list[SparseMap]:
-    """Return the maps without the views beside, the largest first."""
-    left = []
-    for found in maps:
-        poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
-        seen = {k: view for k, view in found.seen.items() if k not in problem.beside}
-        if len(poses) >= 2:
-            left.append(replace(found, T_map_cam=poses, seen=seen))
-    return sorted(left, key=lambda m: (-len(m.T_map_cam), min(m.T_map_cam)))
+def _map_of(work: _Work, model: Any) -> SparseMap:
+    """Return what pycolmap made of a problem, without keyframes that their matches contradict."""
+    found = sparse_map(model, work.problem, work.camera)
+    return _borne_out(found, work) if work.problem.matched else found
+
+
+def _enough(found: SparseMap, settings: MappingSettings) -> bool:
+    """Return whether a map is large enough to be believed."""
+    return len(found.points) >= settings.least_points and len(found.T_map_cam) >= 2
+
+
+def _first_of_all(found: SparseMap) -> tuple[int, int]:
+    """What sorts maps, the largest first."""
+    return -len(found.T_map_cam), min(found.T_map_cam)
+
+
+def _without_beside(found: SparseMap, problem: MapProblem) -> SparseMap:
+    """Return the map without the views beside."""
+    poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
+    seen = {k: view for k, view in found.seen.items() if k not in problem.beside}
+    return replace(found, T_map_cam=poses, seen=seen)
 
 
 def steady(found: SparseMap, most: float) -> bool:
@@ -199,17 +253,15 @@ def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
     return min(large, key=lambda maps: maps[0].error_px, default=[])
 
 
-def _borne_out(
-    found: SparseMap, problem: MapProblem, cache: Any, camera: Camera, settings: MappingSettings
-) -> SparseMap:
+def _borne_out(found: SparseMap, work: _Work) -> SparseMap:
     """Return the map without keyframes that their matches contradict."""
-    seen = {}
+    problem, camera, seen = work.problem, work.camera, {}
     for a, b in sorted(problem.pairs):
         if a in found.T_map_cam and b in found.T_map_cam:
-            rows = cache.correspondence_graph.extract_matches_between_images(a + 1, b + 1)
+            rows = work.cache.correspondence_graph.extract_matches_between_images(a + 1, b + 1)
             rows = np.asarray(rows, np.int64).reshape(-1, 2)
             seen[a, b] = problem.views[a].xy[rows[:, 0]], problem.views[b].xy[rows[:, 1]]
-    out = contradicted(found.T_map_cam, seen, camera, settings.consistency)
+    out = contradicted(found.T_map_cam, seen, camera, work.settings.consistency)
     if not out:
         return found
     poses = {k: T for k, T in found.T_map_cam.items() if k not in out}
@@ -330,6 +382,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     options.ba_refine_extra_params = bool(free_camera)
     options.ba_refine_principal_point = False
     options.ba_local_max_num_iterations = settings.part_iterations
+    options.ba_local_max_refinements = settings.part_rounds
     options.ba_global_max_num_iterations = settings.whole_iterations
     options.ba_global_max_refinements = settings.whole_rounds
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.settled
@@ -344,7 +397,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     mapper.abs_pose_refine_extra_params = bool(free_camera)
     mapper.filter_max_reproj_error = settings.point_error_px * unit
     mapper.filter_min_tri_angle = settings.point_angle_deg
-    mapper.ba_local_min_tri_angle = 2.0
+    mapper.ba_local_min_tri_angle, mapper.ba_local_num_images = 2.0, settings.part_views
     options.triangulation.min_angle = settings.point_angle_deg
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.random_seed = settings.seed

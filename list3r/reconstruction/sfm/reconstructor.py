@@ -32,6 +32,7 @@ from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, st
 from list3r.reconstruction.sfm.mapping import MapProblem, Matches, SparseMap, build_maps, triangulate
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
+from list3r.reconstruction.sfm.two_view import verified_rows
 
 Poses = NDArray[np.float64]
 
@@ -143,7 +144,8 @@ class SfmReconstructor:
         seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
-        return build_maps(wider, camera, free_camera=free, settings=s.mapping)
+        verified = None if free else verified_rows(wider, camera, s.mapping)
+        return build_maps(wider, camera, free_camera=free, settings=s.mapping, verified=verified)
 
     def _given(
         self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera

@@ -152,7 +152,14 @@ class MappingSettings:
     whole_rounds: int = 3
     """and so many times at most, each without what the one before contradicts."""
     part_iterations: int = 10
-    """Most iterations of the adjustment of a new keyframe with those around it."""
+    """Most iterations of the adjustment of a new keyframe with those around it,"""
+    part_rounds: int = 2
+    """so many times at most,"""
+    part_views: int = 6
+    """and so many keyframes at most."""
+    rough_iterations: int = 0
+    """Most iterations of the whole map while it grows, then once each time; the map that is kept is adjusted as above
+    when it is whole. 0 for maps that are adjusted so all the time."""
     settled: float = 0.0
     """Adjustments end when a step gains less than this share of the error."""
     alike: float = 0.95
@@ -245,8 +252,18 @@ class CameraCalibrationSettings:
     """Standard deviation of the logarithm of one window's focal length (redkitchen, 60 to 100 frames: 0.087)."""
     window_weight: float = 4.0
     """So many windows' worth is that belief when the windows of a video tell their own spread."""
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+    """How they are mapped: a focal length is told by the last of the error."""
     doubted_sigmas: float = 2.5
     """A given focal length farther off than this is doubted aloud."""
+
+
+def maps_of_chunks() -> MappingSettings:
+    """Return how the keyframes of a chunk are mapped: maps settle, and grow roughly, which is as near to the truth and
+    to the pictures (docs/decisions/0157 and 0181)."""
+    return MappingSettings(
+        settled=1e-4, growth=2.0, part_iterations=5, part_rounds=1, part_views=4, rough_iterations=10
+    )
 
 
 @dataclass(frozen=True)
@@ -255,8 +272,7 @@ class SfmSettings:
 
     tracks: CornerSettings = field(default_factory=CornerSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
-    mapping: MappingSettings = field(default_factory=lambda: MappingSettings(settled=1e-4))
-    """Settled maps are as near to the truth and to the pictures as those adjusted on (docs/decisions/0157)."""
+    mapping: MappingSettings = field(default_factory=maps_of_chunks)
     fill: FramePoseSettings = field(default_factory=FramePoseSettings)
     calibration: CameraCalibrationSettings = field(default_factory=CameraCalibrationSettings)
     keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)

@@ -1,4 +1,4 @@
-"""Matches that agree on the geometry of two views of one known camera, for videos with many pairs.
+"""Matches that agree on the geometry of two views of one known camera.
 
 OpenCV's MAGSAC (Barath et al., "MAGSAC++, a fast, reliable and accurate robust estimator", CVPR 2020) takes an eighth
 of the time of the three models that pycolmap fits, and keeps the same matches (decision 0075).
