@@ -136,7 +136,7 @@ class SfmReconstructor:
         around: Around | None,
     ) -> list[SparseMap]:
         """Maps of the keyframes, made with the help of frames around the chunk."""
-        s, free = self.settings, "" if self.camera_known else "focal"
+        s = self.settings
         before, behind = ((), ()) if around is None else around(step_beside(tracks, s.links), s.links.beside)
         beside = [*before, *behind]
         early, late = np.split(len(frames) + np.arange(len(beside)), [len(before)])
@@ -144,8 +144,9 @@ class SfmReconstructor:
         seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
-        verified = None if free else verified_rows(wider, camera, s.mapping)
-        return build_maps(wider, camera, free_camera=free, settings=s.mapping, verified=verified)
+        if not self.camera_known:
+            return build_maps(wider, camera, free_camera="focal", settings=s.calibration.mapping)
+        return build_maps(wider, camera, settings=s.mapping, verified=verified_rows(wider, camera, s.mapping))
 
     def _given(
         self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera
