@@ -81,9 +81,11 @@ def summary(pairs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 class Home:
-    """Chunks of both runs of a home."""
+    """Chunks of both runs of a home; of each run those that `kept` names."""
 
-    def __init__(self, preset: str, seed: int, sensor: bool = False) -> None:
+    def __init__(
+        self, preset: str, seed: int, sensor: bool = False, kept: tuple[slice, slice] = (slice(None), slice(None))
+    ) -> None:
         from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
         from benchmarks.simulation.returns import make_return
         from list3r.association.overlap.motion import flag_dynamic
@@ -96,13 +98,15 @@ class Home:
         self.video = make_return(preset, seed)
         model = FeedForwardModel(self.video, errors, seed=seed)
         spans = plan_chunks(len(self.video.time_s), ChunkSettings(), self.video.cuts)
-        self.runs: list[list[Any]] = [[], []]
-        for span in spans:
-            made = model.chunk(span)
-            height, width = made.image_size
-            flagged = flag_dynamic(made.samples, made.library, Camera(width, height, *made.intrinsics))
-            kind = "metric" if sensor else made.scale_kind
-            self.runs[span.start >= self.video.cuts[0]].append(replace(made, library=flagged, scale_kind=kind))
+        self.runs: list[list[Any]] = []
+        for second, part in enumerate(kept):
+            self.runs.append([])
+            for span in [s for s in spans if (s.start >= self.video.cuts[0]) == second][part]:
+                made = model.chunk(span)
+                height, width = made.image_size
+                flagged = flag_dynamic(made.samples, made.library, Camera(width, height, *made.intrinsics))
+                kind = "metric" if sensor else made.scale_kind
+                self.runs[-1].append(replace(made, library=flagged, scale_kind=kind))
         self.second = 0
         """Chunk id of the first one of the second run, once it arrived."""
 

@@ -118,9 +118,8 @@ def test_surroundings_never_hold_more_instances_than_asked_for(count: int) -> No
 
 
 def test_a_room_seen_from_its_other_end_is_joined_and_a_stranger_is_not(tmp_path: Path) -> None:
-    home, other = Home("opposite", 62), Home("opposite", 61)
-    home.runs = [home.runs[0][-5:], home.runs[1][:2]]
-    other.runs[1] = other.runs[1][:1]
+    home = Home("opposite", 62, kept=(slice(-3, None), slice(1)))
+    other = Home("opposite", 61, kept=(slice(0), slice(1)))
     rows = [
         row
         for store, chunk_id, truth, same in home.arrivals(tmp_path / "memory.l3r", other)
