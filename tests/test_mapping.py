@@ -22,7 +22,7 @@ def placed(
     with Store.create(path) as store:
         with store.transaction():
             store.facts.scale_kind = "relative"
-            session = store.sessions.add("simulation", "", {}, 400)
+            session = store.sessions.add("simulation", "", {}, 310)
         for chunk in chunks:
             mapping.add_chunk(store, session, chunk, model, settings, library=False)
         mapping.finish_session(store, session, settings, library=False)
@@ -34,7 +34,7 @@ def placed(
 
 def test_a_chunk_fitted_in_ends_where_solving_the_whole_graph_puts_it(tmp_path: Path) -> None:
     model = FeedForwardModel(make_video("calm", 102), seed=102)
-    chunks = [model.chunk(span) for span in plan_chunks(400, ChunkSettings())]
+    chunks = [model.chunk(span) for span in plan_chunks(310, ChunkSettings())]
     whole = placed(tmp_path / "whole.l3r", chunks, model)
     grown = placed(tmp_path / "grown.l3r", chunks, model, AssociationSettings(solved_whole=0))
     for a, b in zip(whole, grown, strict=True):

@@ -37,7 +37,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def one(walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The memory of the first walk."""
     path = tmp_path_factory.mktemp("memory") / "one.l3r"
-    list3r.build(walks[0], path, settings=SETTINGS, workers=1).close()
+    list3r.build(walks[0], path, settings=SETTINGS, workers=0).close()
     return path
 
 
@@ -46,7 +46,7 @@ def two(one: Path, walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFa
     """The memory of both."""
     path = tmp_path_factory.mktemp("memory") / "two.l3r"
     shutil.copy(one, path)
-    report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1))
+    report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=0))
     assert report.placed == report.chunks
     assert report.ties > 0
     assert report.session == 2
@@ -62,7 +62,7 @@ def interrupt(path: Path, walk: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        update(path, walk, settings=SETTINGS, run=RunOptions(workers=1), watch=Watch(stop))
+        update(path, walk, settings=SETTINGS, run=RunOptions(workers=0), watch=Watch(stop))
 
 
 def test_the_second_session_lies_in_the_world_of_the_first(two: Path, one: Path) -> None:
@@ -120,10 +120,10 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
         assert [i.id for i in store.instances.all()] == [i.id for i in before.instances.all()]
         assert store.events.all() == []
     with pytest.raises(OptionError, match="--resume"):
-        update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1))
-    report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1, resume=True))
+        update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=0))
+    report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=0, resume=True))
     assert report.resumed_chunks == 1
-    again = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1, resume=True))
+    again = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=0, resume=True))
     assert again.events == report.events and again.session == report.session
     with Store.open(path) as store, Store.open(two) as whole:
         assert [(e.instance_id, e.kind) for e in store.events.all()] == [
@@ -141,8 +141,8 @@ def test_an_interrupted_update_can_be_given_up(one: Path, walks: tuple[Path, Pat
     with Store.open(path) as store:
         assert len(store.sessions.all()) == 2 and store.chunks.all(2)
     with pytest.raises(OptionError, match="give it up with --force"):
-        update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1))
-    report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=1, force=True))
+        update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=0))
+    report = update(path, walks[1], settings=SETTINGS, run=RunOptions(workers=0, force=True))
     assert report.resumed_chunks == 0 and report.session == 2
     with Store.open(path) as store:
         assert len(store.sessions.all()) == 2 and store.verify() == []
@@ -159,7 +159,7 @@ def test_a_video_in_which_no_camera_is_placed_leaves_the_memory_as_it_was(one: P
             path,
             black,
             settings=SETTINGS,
-            run=RunOptions(workers=1),
+            run=RunOptions(workers=0),
             options=SourceOptions(intrinsics=(130.0, 130.0, 80.0, 60.0)),
         )
     assert run(["update", str(path), str(black), "--intrinsics", "130,130,80,60"]) == 2
@@ -179,7 +179,7 @@ def test_a_session_whose_poses_are_given_is_placed_in_the_world_of_the_first(
     path = tmp_path / "given.l3r"
     shutil.copy(one, path)
     settings = BuildSettings(poses="given", chunks=SETTINGS.chunks)
-    report = update(path, walks[1], settings=settings, run=RunOptions(workers=1))
+    report = update(path, walks[1], settings=settings, run=RunOptions(workers=0))
     assert report.placed == report.chunks
     assert report.posed == report.frames
     with Store.open(path) as store:
