@@ -21,15 +21,15 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.update import update
 from list3r.simulation.dataset import WalkSettings, write_walk
 
-SETTINGS = BuildSettings(poses="estimate", chunks=ChunkSettings(length=40, overlap=12))
+SETTINGS = BuildSettings(poses="estimate", chunks=ChunkSettings(length=24, overlap=8))
 
 
 @pytest.fixture(scope="module")
 def walks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two walks through one room, of which the second starts elsewhere."""
     folder = tmp_path_factory.mktemp("walks")
-    first = WalkSettings(seed=3, frames=44, size=(192, 144))
-    second = WalkSettings(seed=3, walk_seed=77, frames=36, start=14, size=(192, 144))
+    first = WalkSettings(seed=3, frames=30, size=(192, 144))
+    second = WalkSettings(seed=3, walk_seed=77, frames=22, start=8, size=(192, 144))
     return write_walk(folder / "first", first), write_walk(folder / "second", second)
 
 
@@ -50,7 +50,7 @@ def two(one: Path, walks: tuple[Path, Path], tmp_path_factory: pytest.TempPathFa
     assert report.placed == report.chunks
     assert report.ties > 0
     assert report.session == 2
-    assert report.posed > 30
+    assert report.posed > 18
     return path
 
 
@@ -93,7 +93,7 @@ def test_an_interrupted_build_or_update_is_finished_first(tmp_path: Path, walks:
     path = tmp_path / "begun.l3r"
     info = open_source(walks[0]).info
     with Store.create(path) as store, store.transaction():
-        store.sessions.add(str(walks[0]), info.fingerprint, {}, 44)
+        store.sessions.add(str(walks[0]), info.fingerprint, {}, 30)
     with pytest.raises(OptionError, match="holds no video yet"):
         update(path, walks[1], settings=SETTINGS)
 
