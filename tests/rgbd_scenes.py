@@ -46,17 +46,15 @@ def render(
     time_s: float | None = None,
 ) -> Frame:
     """The frame that a camera at `T_world_cam` takes."""
-    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u, float)], axis=-1)
-    directions = rays @ T_world_cam[:3, :3].T
+    directions = [_rays() @ row for row in T_world_cam[:3, :3]]
     origin = T_world_cam[:3, 3]
-    depth, axis, which = _far_side(origin, directions)
+    depth, axis = _far_side(origin, directions)
+    which = np.zeros(depth.shape, int)
     for k, box in enumerate(boxes):
         z, a = _near_side(origin, directions, box)
         closer = z < depth
-        depth, axis, which = np.where(closer, z, depth), np.where(closer, a, axis), np.where(closer, k + 1, which)
-    points = origin + depth[..., None] * directions
-    color = _shade(points, axis, which, contrast, seed)
+        depth[closer], axis[closer], which[closer] = z[closer], a[closer], k + 1
+    color = _shade([o + depth * d for o, d in zip(origin, directions, strict=True)], axis, which, contrast, seed)
     rng = np.random.default_rng((seed, index))
     if noise:
         depth = depth + rng.normal(size=depth.shape) * SensorNoise().sigma(depth.astype(np.float32))
@@ -66,26 +64,41 @@ def render(
     )
 
 
-def _far_side(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    low, high = np.array(ROOM)
+@lru_cache(maxsize=1)
+def _rays() -> np.ndarray:
+    """Of every pixel, in the camera. Shape (h, w, 3)."""
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    return np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u, float)], axis=-1)
+
+
+def _far_side(origin: np.ndarray, directions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the room's walls and the axis that they are across."""
+    away = []
     with np.errstate(divide="ignore", invalid="ignore"):
-        away = np.where(directions > 0, (high - origin) / directions, (low - origin) / directions)
-    away[np.isnan(away)] = np.inf
-    return away.min(axis=-1), away.argmin(axis=-1), np.zeros(away.shape[:2], int)
+        for low, high, o, d in zip(*ROOM, origin, directions, strict=True):
+            away.append(np.where(d > 0, high - o, low - o) / d)
+    x, y, z = (np.where(np.isnan(a), np.inf, a) for a in away)
+    return np.minimum(np.minimum(x, y), z), np.where(np.minimum(x, y) <= z, y < x, 2)
 
 
-def _near_side(origin: np.ndarray, directions: np.ndarray, box: tuple) -> tuple[np.ndarray, np.ndarray]:
+def _near_side(origin: np.ndarray, directions: list[np.ndarray], box: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a box, infinite beside it, and the axis that the face is across."""
+    near, far = [], []
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b = (np.array(box[0]) - origin) / directions, (np.array(box[1]) - origin) / directions
-    near, far = np.minimum(a, b), np.maximum(a, b)
-    enter, leave = near.max(axis=-1), far.min(axis=-1)
-    return np.where((enter < leave) & (enter > 0), enter, np.inf), near.argmax(axis=-1)
+        for low, high, o, d in zip(*box, origin, directions, strict=True):
+            a, b = (low - o) / d, (high - o) / d
+            near.append(np.minimum(a, b))
+            far.append(np.maximum(a, b))
+    x, y, z = near
+    enter, leave = np.maximum(np.maximum(x, y), z), np.minimum(np.minimum(far[0], far[1]), far[2])
+    axis = np.where(np.maximum(x, y) >= z, y > x, 2)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf), axis
 
 
-def _shade(points: np.ndarray, axis: np.ndarray, which: np.ndarray, contrast: float, seed: int) -> np.ndarray:
+def _shade(points: list[np.ndarray], axis: np.ndarray, which: np.ndarray, contrast: float, seed: int) -> np.ndarray:
     """Texture by the two coordinates along the face, shifted for each thing."""
-    first = np.where(axis == 0, points[..., 1], points[..., 0])
-    second = np.where(axis == 2, points[..., 1], points[..., 2])
+    first = np.where(axis == 0, points[1], points[0])
+    second = np.where(axis == 2, points[1], points[2])
     x = ((first + 0.37 * which + 0.71 * axis) * 200 % 600).astype(np.float32)
     y = ((second + 0.53 * which + 0.29 * axis) * 200 % 600).astype(np.float32)
     tile = cv2.remap(_texture(seed, contrast), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)

@@ -132,13 +132,13 @@ def test_a_build_that_places_no_camera_leaves_no_memory_and_gives_the_old_one_ba
     folder, memory = save(tmp_path / "still", [3] * 6), tmp_path / "m.l3r"
     settings = BuildSettings("sfm", "estimate", device="cpu")
     with pytest.raises(TrackingError, match=r"any frame of .*still \(6 frames\); frames 0 to 5: the camera stands"):
-        build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=1))
+        build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=0))
     assert list(tmp_path.glob("m.l3r*")) == []
     with Store.create(memory) as store, store.transaction():
         write_small_room(store)
         before = [i.id for i in store.instances.all()]
     with pytest.raises(TrackingError):
-        build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=1, force=True))
+        build(folder, memory, options=OPTIONS, settings=settings, run=RunOptions(workers=0, force=True))
     assert [p.name for p in tmp_path.glob("m.l3r*")] == ["m.l3r"]
     with Store.open(memory) as store:
         assert before and [i.id for i in store.instances.all()] == before
@@ -146,7 +146,7 @@ def test_a_build_that_places_no_camera_leaves_no_memory_and_gives_the_old_one_ba
 
 def test_one_frame_is_refused_in_one_line_by_the_program(tmp_path: Path) -> None:
     folder = save(tmp_path / "one", [0])
-    words = ["build", str(folder), "-m", str(tmp_path / "m.l3r"), "--workers", "1"]
+    words = ["build", str(folder), "-m", str(tmp_path / "m.l3r"), "--workers", "0"]
     done = subprocess.run([sys.executable, "-m", "list3r", *words], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stdout == ""
     errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]

@@ -24,7 +24,7 @@ from list3r.cli import main
 def add_chunk(*_, **__):
     {end}
 list3r.pipeline.session.add_chunk = add_chunk
-sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given", "--workers", "1", *{more!r}]
+sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given", "--workers", "0", *{more!r}]
 main()
 """
     command = [sys.executable, "-c", program]
@@ -49,7 +49,7 @@ def test_a_build_killed_before_its_first_chunk_can_be_opened_and_resumed(walk: P
     assert "--resume" in run("verify", memory).stdout
     judged = run("eval", "trajectory", walk, memory)
     assert judged.returncode == 2 and "--resume" in judged.stderr
-    assert run("build", walk, "-m", memory, "--poses", "given", "--resume").returncode == 0
+    assert run("build", walk, "-m", memory, "--poses", "given", "--workers", "0", "--resume").returncode == 0
     assert [p.name for p in tmp_path.iterdir()] == ["killed.l3r"]
     with list3r.open(memory) as scene:
         assert len(scene.store.trajectory.poses()) == 4
@@ -57,7 +57,8 @@ def test_a_build_killed_before_its_first_chunk_can_be_opened_and_resumed(walk: P
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_build_that_is_told_to_end_leaves_nothing_half_written(name: str, walk: Path, tmp_path: Path) -> None:
-    result = build_ended(walk, tmp_path / "ended.l3r", f"os.kill(os.getpid(), signal.{name}); signal.pause()")
+    workers = ["--workers", "1" if name == "SIGTERM" else "0"]
+    result = build_ended(walk, tmp_path / "ended.l3r", f"os.kill(os.getpid(), signal.{name}); signal.pause()", *workers)
     assert result.returncode == 1
     assert "nothing was changed" in result.stderr and "Traceback" not in result.stderr
     assert list(tmp_path.iterdir()) == []
@@ -77,7 +78,7 @@ def test_a_killed_replacement_leaves_nothing_aside_in_the_end(option: str, walk:
     memory = write_room(tmp_path / "room.l3r")
     build_ended(walk, memory, "os._exit(9)", "--force")
     assert (tmp_path / "room.l3r.replaced").exists()
-    result = run("build", walk, "-m", memory, "--poses", "given", option)
+    result = run("build", walk, "-m", memory, "--poses", "given", "--workers", "0", option)
     assert result.returncode == 0, result.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["room.l3r"]
 
@@ -93,7 +94,7 @@ def test_a_memory_behind_a_link_is_written_there(walk: Path, tmp_path: Path) -> 
     real, link = tmp_path / "real.l3r", tmp_path / "link.l3r"
     link.symlink_to(real)
     for more in ([], ["--force"]):
-        result = run("build", walk, "-m", link, "--poses", "given", *more)
+        result = run("build", walk, "-m", link, "--poses", "given", "--workers", "0", *more)
         assert result.returncode == 0, result.stderr
         assert link.is_symlink() and not real.is_symlink()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.l3r", "real.l3r"]

@@ -35,9 +35,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from list3r.simulation.dataset import WalkSettings, write_walk
 
     base = tmp_path_factory.mktemp("walk")
-    write_walk(base / "walk", WalkSettings(seed=3, frames=30))
+    write_walk(base / "walk", WalkSettings(seed=3, frames=10, size=(160, 120)))
     path = base / "m.l3r"
-    assert run(["build", str(base / "walk"), "-m", str(path), "--workers", "1", "--json"]) == 0
+    assert run(["build", str(base / "walk"), "-m", str(path), "--workers", "0", "--json"]) == 0
     return path
 
 
