@@ -19,6 +19,7 @@ from list3r.memory.records import (
     Support,
 )
 from list3r.memory.store.store import Store
+from tests.ray_boxes import through_box
 
 SIZE = (120, 160)
 FOCAL = 140.0
@@ -61,13 +62,11 @@ def cast(room: Mapping[str, Box], T_world_cam: Array) -> tuple[Array, np.ndarray
     """Depth along z and the number of the box (-1 none) in each pixel. Shapes (h, w)."""
     v, u = np.mgrid[: SIZE[0], : SIZE[1]]
     rays = np.stack([(u - 79.5) / FOCAL, (v - 59.5) / FOCAL, np.ones(SIZE)], axis=-1).reshape(-1, 3)
-    world = rays @ T_world_cam[:3, :3].T
+    world = np.ascontiguousarray((rays @ T_world_cam[:3, :3].T).T)
     depth, owner = np.full(len(rays), np.inf), np.full(len(rays), -1)
     for number, box in enumerate(room.values()):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            a = (np.array(box.center) - np.array(box.size) / 2 - T_world_cam[:3, 3]) / world
-            b = (np.array(box.center) + np.array(box.size) / 2 - T_world_cam[:3, 3]) / world
-        near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+        half = np.array(box.size) / 2
+        near, far = through_box(T_world_cam[:3, 3], world, np.array(box.center) - half, np.array(box.center) + half)
         hit = (near > 0) & (near <= far) & (near < depth)
         depth[hit], owner[hit] = near[hit], number
     depth[~np.isfinite(depth)] = 0.0

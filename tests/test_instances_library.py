@@ -22,6 +22,7 @@ from list3r.memory.store.store import Store
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import make_keyframes
 from tests.conftest import chunk_result
+from tests.ray_boxes import through_box
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 
@@ -54,14 +55,10 @@ def render(
     """Depth along z (0 for a miss) and the block at each pixel, -1 for none."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
-    direction, origin = rays @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
+    direction = np.ascontiguousarray(np.moveaxis(rays @ T_world_cam[:3, :3].T, -1, 0))
     depth, which = np.full(u.shape, np.inf), np.full(u.shape, -1)
     for number, block in enumerate(blocks):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            near = (np.array(block.low) - origin) / direction
-            far = (np.array(block.high) - origin) / direction
-        enter = np.minimum(near, far).max(axis=-1)
-        leave = np.maximum(near, far).min(axis=-1)
+        enter, leave = through_box(T_world_cam[:3, 3], direction, block.low, block.high)
         hit = (enter < leave) & (enter > 0.1) & (enter < depth)
         depth[hit], which[hit] = enter[hit], number
     return np.where(np.isfinite(depth), depth, 0.0), which

@@ -71,9 +71,9 @@ def test_point_grid_finds_masks(model: str, checkpoints: dict[str, Path], chunk)
 
 
 @pytest.mark.parametrize("model", ["sam2", "sam3", "edgetam"])
-def test_tracker_follows_prompts_through_the_chunk(model: str, checkpoints: dict[str, Path], chunk) -> None:
-    frames, reconstruction = chunk
-    settings = InstanceSettings(anchor_step=5)
+def test_tracker_follows_prompts_through_the_chunk(model: str, checkpoints: dict[str, Path]) -> None:
+    frames, reconstruction = walk(SCENE, 6)
+    settings = InstanceSettings(anchor_step=3)
     tracker = VideoTracker(model, checkpoints[f"tracking/{model}"], "cpu", settings)
     library = build_library(frames, reconstruction, settings, LearnedDiscoverer(settings), tracker)
     assert isinstance(library, LocalLibrary)

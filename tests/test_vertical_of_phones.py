@@ -26,13 +26,19 @@ _LARGE = Camera(recordings.WIDTH, recordings.HEIGHT, *recordings.K)
 
 
 @cache
+def renderers() -> tuple[Renderer, Renderer]:
+    """Of pictures and of depth, in a simulated room."""
+    world = WalkSettings(seed=1).world()
+    return Renderer(world, _LARGE), Renderer(world, _LARGE.resized(recordings.DEPTH_HEIGHT, recordings.DEPTH_WIDTH))
+
+
+@cache
 def filmed(turns: int) -> list[recordings.Shot]:
     """A few steps through a simulated room with the phone held one way."""
-    walk = WalkSettings(seed=1)
-    world, small = walk.world(), _LARGE.resized(recordings.DEPTH_HEIGHT, recordings.DEPTH_WIDTH)
-    pictures, depths = Renderer(world, _LARGE), Renderer(world, small)
+    pictures, depths = renderers()
     out = []
-    for T in walk.poses()[1][: 3 * recordings.COUNT : 3] @ np.linalg.matrix_power(CLOCKWISE, -turns % 4):
+    steps = WalkSettings(seed=1).poses()[1][: 3 * recordings.COUNT : 3]
+    for T in steps @ np.linalg.matrix_power(CLOCKWISE, -turns % 4):
         color = np.clip(pictures.render(T).color, 0, 255).astype(np.uint8)
         out.append(recordings.Shot(T, color, depths.render(T).depth))
     return out
