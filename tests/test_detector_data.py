@@ -37,12 +37,12 @@ def shown_at(store: Store, frame: int, x: int, y: int) -> int:
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fifty frames around the table, built with given poses and named by the small detector."""
+    """Frames around the table, built with given poses and named by the small detector."""
     pytest.importorskip("ncnn")
     path = tmp_path_factory.mktemp("kitchen") / "table.l3r"
-    source = [str(KITCHEN), "--frames", "240:340", "--every", "2", "--poses", "given"]
+    source = [str(KITCHEN), "--frames", "266:334", "--every", "2", "--poses", "given"]
     detector = ["--detector", str(WEIGHTS / "nanodet-m.param")]
-    assert run(["build", *source, "-m", str(path), "--chunk", "50", "--workers", "1", *detector]) == 0
+    assert run(["build", *source, "-m", str(path), "--chunk", "50", "--workers", "0", *detector]) == 0
     return path
 
 

@@ -120,7 +120,7 @@ def test_a_place_that_cannot_be_written_is_one_line(name: str, single: SceneMemo
     assert held(out) == {"file": b"mine"}
 
 
-MOMENTS = (0.2, 0.6, 0.97)
+MOMENTS = (0.4, 0.97)
 """At which an export is interrupted: shares of the calls that it makes."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -35,9 +36,10 @@ def test_redkitchen_calibrates_from_a_wrong_start(shared_data: Path, focal: floa
     assert found.score > 1.3 * found.score_assumed and known > 0.95 * found.score
 
 
+@cache
 def calibrate_score(path: Path) -> float:
     """How well edges meet with the constants that the layout knows."""
-    return calibrate(path, SourceOptions(), DepthCalibrationSettings(frames=10, candidates=3)).score_assumed
+    return calibrate(path, SourceOptions(), FEW).score_assumed
 
 
 def test_cabinet_is_registered(shared_data: Path) -> None:

@@ -168,7 +168,7 @@ def test_a_folder_that_grows_becomes_a_memory_that_can_be_asked_meanwhile(tmp_pa
     writer = threading.Thread(target=record)
     writer.start()
     request = BuildRequest(poses="given", chunk=12, overlap=4)
-    report = build_live(growing, memory, settings=request, run=RunOptions(live=True), live=QUICK)
+    report = build_live(growing, memory, settings=request, run=RunOptions(live=True, workers=1), live=QUICK)
     writer.join()
     assert report.live is not None and (report.posed, report.live.dropped, report.chunks) == (24, 0, 3)
     assert seen == [1]
@@ -208,7 +208,9 @@ def test_a_recorded_bag_becomes_a_memory(tmp_path: Path) -> None:
 
     writer = threading.Thread(target=record)
     writer.start()
-    report = build_live(growing, memory, settings=BuildRequest(poses="given"), run=RunOptions(live=True), live=QUICK)
+    report = build_live(
+        growing, memory, settings=BuildRequest(poses="given"), run=RunOptions(live=True, workers=1), live=QUICK
+    )
     writer.join()
     assert report.live is not None and (report.posed, report.live.dropped) == (COUNT, 0)
 

@@ -19,7 +19,7 @@ from list3r.frames.live.usbmux import ADDRESS
 from list3r.frames.source import open_source
 from list3r.memory.errors import SourceError
 from list3r.pipeline.live import build_live
-from list3r.pipeline.request import BuildRequest, Watch
+from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer
 from tests.phone_server import FRONT, message, usbmuxd
@@ -157,7 +157,8 @@ def test_a_walk_with_a_phone_becomes_a_memory(tmp_path: Path, monkeypatch: pytes
     told: list[str] = []
     watch, request = Watch(note=told.append), BuildRequest(chunk=8, overlap=3)
     with usbmuxd([sent[:14], sent[14:]], monkeypatch, tmp_path):
-        report = build_live("record3d:", tmp_path / "m.l3r", settings=request, live=QUICK, watch=watch)
+        run = RunOptions(live=True, workers=1)
+        report = build_live("record3d:", tmp_path / "m.l3r", settings=request, run=run, live=QUICK, watch=watch)
     assert report.live is not None and (report.live.received, report.live.reconnects) == (24, 2)
     assert report.posed == 24 and report.live.gaps == 1
     with list3r.open(tmp_path / "m.l3r") as scene:

@@ -192,11 +192,11 @@ def test_sfm_is_known_by_name_and_needs_neither_depth_nor_camera():
 
 @pytest.mark.data
 def test_redkitchen_in_colour(shared_data: Path):
-    source = open_source(shared_data / "redkitchen", SourceOptions(start=200, stop=260))
-    frames = [replace(f, depth=None) for f in source.read(0, 60) if isinstance(f, Frame)]
+    source = open_source(shared_data / "redkitchen", SourceOptions(start=200, stop=240))
+    frames = [replace(f, depth=None) for f in source.read(0, 40) if isinstance(f, Frame)]
     assert source.info.camera is not None
     made = SfmReconstructor()(frames, source.info.camera)
-    assert made.posed.sum() >= 59
+    assert made.posed.sum() >= 39
     S = umeyama(made.T_chunk_cam[made.posed, :3, 3], centres(frames)[made.posed], with_scale=True)
     off = np.linalg.norm(S.apply(made.T_chunk_cam[made.posed, :3, 3]) - centres(frames)[made.posed], axis=1)
     assert np.sqrt((off**2).mean()) < 0.01
