@@ -107,7 +107,7 @@ def build_maps(
         made = _grown(work, pair)
         maps = [found for found, _ in made]
         own = [(_without_beside(found, problem), model) for found, model in made]
-        own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _first_of_all(m[0]))
+        own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
         grown.append([found for found, _ in own])
         models |= {id(found): model for found, model in own}
         if agreed(grown, chosen) or (maps and all(steady(m, chosen.steady) for m in maps)):
@@ -210,8 +210,8 @@ def _enough(found: SparseMap, settings: MappingSettings) -> bool:
     return len(found.points) >= settings.least_points and len(found.T_map_cam) >= 2
 
 
-def _first_of_all(found: SparseMap) -> tuple[int, int]:
-    """What sorts maps, the largest first."""
+def _largest_first(found: SparseMap) -> tuple[int, int]:
+    """Key that sorts maps."""
     return -len(found.T_map_cam), min(found.T_map_cam)
 
 

@@ -89,7 +89,7 @@ def as_bright(
 
 
 def _median(values: NDArray[np.float64]) -> float:
-    """Median of known values (N,), N >= 1, in a tenth of the time of NumPy's for a few hundred."""
+    """Median of known values (N,), N >= 1, in a sixth to an eighth of the time of NumPy's for 50 to 500."""
     low, high = (len(values) - 1) // 2, len(values) // 2
     ordered = np.partition(values, (low, high))
     return float(ordered[low] + ordered[high]) / 2.0
