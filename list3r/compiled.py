@@ -2,6 +2,7 @@
 
 Machine code is kept beside the module, or in the user's cache where that cannot be written, so that later processes
 load it. Nothing is reordered (no `fastmath`, one thread), so that results do not depend on how many processes work.
+Dividing by zero gives what NumPy gives, unasked: a loop that would have to ask at each pixel takes one pixel at a time.
 """
 
 from __future__ import annotations
@@ -18,6 +19,6 @@ R = TypeVar("R")
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function as machine code. Its arguments are numbers and C-contiguous arrays."""
     try:
-        return cast(Callable[P, R], numba.njit(cache=True)(function))
+        return cast(Callable[P, R], numba.njit(cache=True, error_model="numpy")(function))
     except RuntimeError:  # nothing can be written: it is compiled in every process
-        return cast(Callable[P, R], numba.njit()(function))
+        return cast(Callable[P, R], numba.njit(error_model="numpy")(function))

@@ -30,7 +30,7 @@ def zncc_cost(
     total, count = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     inside, sums = np.empty((height, width), np.float32), np.empty((3, height, width), np.float32)
     line, place = np.empty((3, width + 2 * radius), np.float32), np.empty((2, width), np.float32)
-    tried = np.empty(width, np.float32)
+    tried, window = np.empty(width, np.float32), np.empty((3, width), np.float32)
     for d in range(depths.shape[0]):
         total[:] = _ZERO
         count[:] = _ZERO
@@ -40,7 +40,7 @@ def zncc_cost(
                 _place_row(rotated[s], shift[s], v, tried, place, inside)
                 _look_up_row(sources[s], place, line, radius)
                 _row_sums(line, reference, v, radius, sums)
-            _add_zncc(reference, sums, inside, radius, np.float32(noise * noise), total)
+            _add_zncc(reference, sums, inside, radius, np.float32(noise * noise), window, total)
             count += inside
         for v in range(height):
             for u in range(width):
@@ -67,15 +67,22 @@ def _place_row(to: Floats, by: Floats, v: int, inverse: Floats, place: Floats, i
 
 @compiled
 def _look_up_row(source: Floats, place: Floats, line: Floats, radius: int) -> None:
-    """Write the brightness of a picture at places (2, w) inside it into a line, which is wider by the radius."""
+    """Write the brightness of a picture at places (2, w) inside it into a line, which is wider by the radius.
+
+    Numbers without a sign are looked up several at a time.
+    """
     height, width = source.shape
-    for u in range(place.shape[1]):
-        i, j = int(place[0, u]), int(place[1, u])
-        a, b = place[0, u] - np.float32(i), place[1, u] - np.float32(j)
-        k, m = min(i + 1, width - 1), min(j + 1, height - 1)
-        above = source[j, i] + (source[j, k] - source[j, i]) * a
-        below = source[m, i] + (source[m, k] - source[m, i]) * a
-        line[0, radius + u] = above + (below - above) * b
+    flat, x, y, values = source.reshape(height * width), place[0], place[1], line[0]
+    for u in range(len(x)):
+        i, j = np.int32(x[u]), np.int32(y[u])
+        a, b = x[u] - np.float32(i), y[u] - np.float32(j)
+        right = np.uint32(1) if i + 1 < width else np.uint32(0)
+        down = np.uint32(width) if j + 1 < height else np.uint32(0)
+        at = np.uint32(j) * np.uint32(width) + np.uint32(i)
+        under = np.uint32(at + down)
+        above = flat[at] + (flat[np.uint32(at + right)] - flat[at]) * a
+        below = flat[under] + (flat[np.uint32(under + right)] - flat[under]) * a
+        values[np.uint32(radius + u)] = above + (below - above) * b
 
 
 @compiled
@@ -98,21 +105,57 @@ def _row_sums(line: Floats, reference: Floats, v: int, radius: int, sums: Floats
 
 
 @compiled
-def _add_zncc(reference: Floats, sums: Floats, inside: Floats, radius: int, noise: np.float32, total: Floats) -> None:
-    """Add the correlation of windows to a total, where a source sees the place."""
+def _add_zncc(
+    reference: Floats, sums: Floats, inside: Floats, radius: int, noise: np.float32, window: Floats, total: Floats
+) -> None:
+    """Add the correlation of windows to a total, where a source sees the place; `window` (3, w) is written over.
+
+    Loops run through rows that were taken out of their arrays before, several pixels at a time.
+    """
     _, height, width = reference.shape
-    size, window = np.float32((2 * radius + 1) ** 2), np.empty((3, width), np.float32)
-    mean, spread = reference[1], reference[2]
+    size = np.float32((2 * radius + 1) ** 2)
     for v in range(height):
         for q in range(3):
-            window[q] = sums[q, max(v - radius, 0)]
+            row, first = window[q], sums[q, max(v - radius, 0)]
+            for u in range(width):
+                row[u] = first[u]
             for k in range(v - radius + 1, v + radius + 1):
-                window[q] += sums[q, min(max(k, 0), height - 1)]
+                more = sums[q, min(max(k, 0), height - 1)]
+                for u in range(width):
+                    row[u] += more[u]
+        ones, squares, products = window[0], window[1], window[2]
+        mean, spread, seen, out = reference[1, v], reference[2, v], inside[v], total[v]
         for u in range(width):
-            own = window[0, u] / size
-            varied = max(window[1, u] / size - own * own, _ZERO) + noise
-            cross = window[2, u] / size - own * mean[v, u]
-            total[v, u] += cross / np.sqrt(varied * spread[v, u]) * inside[v, u]
+            own = ones[u] / size
+            varied = max(squares[u] / size - own * own, _ZERO) + noise
+            cross = products[u] / size - own * mean[u]
+            out[u] += cross / np.sqrt(varied * spread[u]) * seen[u]
+
+
+@compiled
+def lowest(cost: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the place of the least of costs (D, h, w), D >= 3, by a parabola, and its whole plane; see
+    `sweep.below_planes`.
+    """
+    depths, height, width = cost.shape
+    place, plane = np.empty((height, width), np.float32), np.empty((height, width), np.int64)
+    least, first = np.empty(width, np.float32), np.empty(width, np.int32)
+    for v in range(height):
+        least[:] = cost[0, v]
+        first[:] = np.int32(0)
+        for d in range(1, depths):
+            row = cost[d, v]
+            for u in range(width):
+                lower = row[u] < least[u]
+                least[u] = row[u] if lower else least[u]
+                first[u] = np.int32(d) if lower else first[u]
+        for u in range(width):
+            d = min(max(int(first[u]), 1), depths - 2)
+            left, middle, right = cost[d - 1, v, u], cost[d, v, u], cost[d + 1, v, u]
+            bend = max(left - np.float32(2.0) * middle + right, np.float32(1e-6))
+            offset = min(max(_HALF * (left - right) / bend, -_ONE), _ONE)
+            place[v, u], plane[v, u] = np.float32(d) + offset, d
+    return place, plane
 
 
 @compiled
@@ -237,24 +280,30 @@ def splat(inverse: Floats, sigma: Floats, rotated: Floats, shift: Floats, tolera
 @compiled
 def _keep_nearest(places: Floats, nearest: Floats) -> None:
     """Write the greatest inverse depth of the points around each pixel."""
+    height, width = nearest.shape
     for k in range(places.shape[1]):
+        column, row, right, down = _corner(places[0, k], places[1, k])
         for n in range(4):
-            share, row, column = _share(places[0, k], places[1, k], n, nearest.shape[0], nearest.shape[1])
-            if share > _ZERO:
-                nearest[row, column] = max(nearest[row, column], places[2, k])
+            u, v, share = column + n % 2, row + n // 2, _share(right, down, n)
+            if share > _LEAST and 0 <= u < width and 0 <= v < height and places[2, k] > nearest[v, u]:
+                nearest[v, u] = places[2, k]
 
 
 @compiled
 def _add_shares(places: Floats, front: Floats, mean: Floats, error: Floats, total: Floats) -> None:
     """Add what the points around each pixel, of those before its `front`, say, by their weights."""
-    for n in range(4):
-        for k in range(places.shape[1]):
-            share, row, column = _share(places[0, k], places[1, k], n, front.shape[0], front.shape[1])
-            if share > _ZERO and places[2, k] > front[row, column]:
-                weight = share / (places[3, k] * places[3, k])
-                total[row, column] += weight
-                mean[row, column] += weight * places[2, k]
-                error[row, column] += weight * places[3, k]
+    height, width = front.shape
+    for k in range(places.shape[1]):
+        column, row, right, down = _corner(places[0, k], places[1, k])
+        inverse, sigma = places[2, k], places[3, k]
+        sure = _ONE / (sigma * sigma)
+        for n in range(4):
+            u, v, share = column + n % 2, row + n // 2, _share(right, down, n)
+            if share > _LEAST and 0 <= u < width and 0 <= v < height and inverse > front[v, u]:
+                weight = share * sure
+                total[v, u] += weight
+                mean[v, u] += weight * inverse
+                error[v, u] += weight * sigma
 
 
 @compiled
@@ -276,12 +325,16 @@ def _landed(inverse: Floats, sigma: Floats, to: Floats, by: Floats) -> Floats:
 
 
 @compiled
-def _share(x: np.float32, y: np.float32, n: int, height: int, width: int) -> tuple[np.float32, int, int]:
-    """Return the bilinear share of one of the four pixels around a place, 0 for little or outside; its row, column."""
-    column, row = int(np.floor(x)) + n % 2, int(np.floor(y)) + n // 2
-    share = (_ONE - abs(x - np.float32(column))) * (_ONE - abs(y - np.float32(row)))
-    inside = 0 <= column < width and 0 <= row < height and share > _LEAST
-    return share if inside else _ZERO, row, column
+def _corner(x: np.float32, y: np.float32) -> tuple[int, int, np.float32, np.float32]:
+    """Return column and row of the pixel left above a place, and how far right and below it the place lies."""
+    column, row = int(np.floor(x)), int(np.floor(y))
+    return column, row, x - np.float32(column), y - np.float32(row)
+
+
+@compiled
+def _share(right: np.float32, down: np.float32, n: int) -> np.float32:
+    """Return the bilinear share of one of the four pixels around a place."""
+    return (right if n % 2 else _ONE - right) * (down if n // 2 else _ONE - down)
 
 
 @compiled

@@ -253,11 +253,11 @@ def _adjust_together(
     solver = options.ceres
     solver.loss_function_type, solver.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, 0.5
     solver.solver_options.num_threads, solver.solver_options.max_num_iterations = 1, 60
-    solver.solver_options.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in made.reg_image_ids():
         config.add_image(image_id)
-    for _ in range(settings.rounds):
+    for left in reversed(range(settings.rounds)):
+        solver.solver_options.function_tolerance = settings.early_settled if left else settings.settled
         pycolmap.create_default_bundle_adjuster(options, config, made).solve()
         pycolmap.ObservationManager(made).filter_points3D_with_large_reprojection_error(
             settings.most_error_px, set(made.points3D), pycolmap.ReprojectionErrorType.PIXEL

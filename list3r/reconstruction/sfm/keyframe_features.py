@@ -16,6 +16,7 @@ from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.features.local import LEARNED_RATIO, nearest_pairs
 from list3r.reconstruction.features.vlad import root_sift
 from list3r.reconstruction.sfm.settings import FinderSettings
+from list3r.reconstruction.sfm.tracks import shrinkage, shrunk
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -60,15 +61,17 @@ def make_finder(
 
 def sift_features(gray: NDArray[np.uint8], settings: FinderSettings) -> LocalFeatures:
     """SIFT features of a grey picture, each place once."""
+    factor = shrinkage(gray.shape, settings.width)
     sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
-    keypoints, descriptors = sift.detectAndCompute(gray, None)
+    keypoints, descriptors = sift.detectAndCompute(shrunk(gray, factor), None)
     if descriptors is None:
         return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), settings.ratio)
     xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
     order = np.lexsort((xy[:, 0], xy[:, 1], -np.array([k.response for k in keypoints])))[: settings.count]
     _, single = np.unique(xy[order], axis=0, return_index=True)
     order = order[np.sort(single)]
-    return LocalFeatures(xy[order], root_sift(descriptors[order].astype(np.uint8)), settings.ratio)
+    place = (xy[order] + np.float32(0.5)) / np.float32(factor) - np.float32(0.5)
+    return LocalFeatures(place, root_sift(descriptors[order].astype(np.uint8)), settings.ratio)
 
 
 def match_features(a: LocalFeatures, b: LocalFeatures) -> Ints:

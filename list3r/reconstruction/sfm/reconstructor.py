@@ -140,7 +140,8 @@ class SfmReconstructor:
         before, behind = ((), ()) if around is None else around(step_beside(tracks, s.links), s.links.beside)
         beside = [*before, *behind]
         early, late = np.split(len(frames) + np.arange(len(beside)), [len(before)])
-        few = replace(s.links.features, count=s.links.ahead_features, learned_count=s.links.ahead_features)
+        count = s.links.ahead_features
+        few = replace(s.links.features, width=s.links.ahead_width, count=count, learned_count=count)
         seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)

@@ -1,6 +1,7 @@
 """Follow corners through a chunk: pyramidal Lucas-Kanade from frame to frame.
 
-Each position is then refined against the frame where the corner was first seen, so that a track does not creep.
+In keyframes, and every few frames, each position is then refined against the frame where the corner was first seen, so
+that a track does not creep.
 
 Frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where nearly all
 corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in those too
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.reconstruction.ranks import median
 from list3r.reconstruction.sfm.settings import CornerSettings
 
 Gray = NDArray[np.uint8]
@@ -79,20 +81,13 @@ def as_bright(
         gain = float(np.clip(gain, *_GAINS))
         offset = middle_b - gain * middle_a
         off = np.abs(gain * a + offset - b)
-        kept = off <= max(2.0, 3.0 * _median(off))
-    was, left = _median(np.abs(a - b)), _median(np.abs(gain * a + offset - b))
+        kept = off <= max(2.0, 3.0 * median(off))
+    was, left = median(np.abs(a - b)), median(np.abs(gain * a + offset - b))
     if was < least or left > _UNTOLD * was:
         return old
     return np.asarray(
         cv2.LUT(old, np.clip(np.rint(gain * np.arange(256.0) + offset), 0, 255).astype(np.uint8)), np.uint8
     )
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    """Median of known values (N,), N >= 1, in a sixth to an eighth of the time of NumPy's for 50 to 500."""
-    low, high = (len(values) - 1) // 2, len(values) // 2
-    ordered = np.partition(values, (low, high))
-    return float(ordered[low] + ordered[high]) / 2.0
 
 
 _UNTOLD = 0.5
@@ -105,6 +100,19 @@ _GAINS = (0.25, 4.0)
 """Changes of contrast that are believed."""
 
 
+def shrinkage(shape: tuple[int, ...], width: int) -> float:
+    """Return the factor by which a picture (h, w) is shrunk so that its longer side is `width` px at the most."""
+    return min(1.0, width / max(shape))
+
+
+def shrunk(gray: Gray, factor: float) -> Gray:
+    """Return a picture shrunk by a factor. A place x of it is (x + 0.5) / factor - 0.5 of the picture."""
+    if factor == 1.0:
+        return gray
+    size = (round(gray.shape[1] * factor), round(gray.shape[0] * factor))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def smoothed(gray: Gray) -> Gray:
     """Mean grey values of the 7 x 7 px round each pixel."""
     return np.asarray(cv2.blur(gray, (7, 7)), np.uint8)
@@ -114,6 +122,16 @@ def values_at(image: Gray, xy: Floats) -> NDArray[np.float64]:
     """Values of the pixels nearest to places (N, 2); those outside count as the rim. Shape (N,)."""
     x, y = np.clip(np.rint(xy), 0, np.array(image.shape[::-1]) - 1).astype(int).T
     return np.asarray(image[y, x], np.float64)
+
+
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+"""When Lucas-Kanade ends."""
+
+
+def _inside(xy: Floats, gray: Gray) -> NDArray[np.bool_]:
+    """Which places (N, 2) lie in a picture, off its border. Shape (N,)."""
+    height, width = gray.shape
+    return np.asarray((xy >= 1).all(axis=1) & (xy[:, 0] < width - 2) & (xy[:, 1] < height - 2), np.bool_)
 
 
 @dataclass
@@ -151,26 +169,32 @@ class _Follower:
     keyframes: list[int] = field(default_factory=list)
     runs: list[int] = field(default_factory=list)
     flows: list[float] = field(default_factory=list)
-    at_keyframe: dict[int, Floats] = field(default_factory=dict)
+    at_keyframe: _Alive = field(default_factory=_Alive.none)
+    """Corners as the last keyframe saw them."""
     next_id: int = 0
     run: int = -1
+    unrefined: int = 0
+    """Frames since the last one in which places were refined."""
     _moved: float = float("nan")
 
     def __post_init__(self) -> None:
-        self.shrink = min(1.0, self.settings.width / max(self.shape))
+        self.shrink = shrinkage(self.shape, self.settings.width)
         self.longer = max(self.shape) * self.shrink
 
     def follow(self, gray: Gray) -> bool:
         """Look for the corners in a frame; False, and nothing changed, when nearly all of them are lost."""
-        before = len(self.alive.ids)
+        before, small = len(self.alive.ids), shrunk(gray, self.shrink)
         if not before:
             return False
-        found = self._followed(self._small(gray))
+        found = self._flowed(small)
+        due = self.unrefined + 1 >= self.settings.refined_every or self._moved_enough(found)
+        if due:
+            found = self._refined(found, small)
         if len(found.ids) < max(self.settings.least_survival * before, self.settings.least_corners / 2):
             return False
         moved = found.xy - self.alive.xy[np.searchsorted(self.alive.ids, found.ids)]
         self._moved = float(np.median(np.linalg.norm(moved, axis=1))) / self.longer
-        self.alive = found
+        self.alive, self.unrefined = found, 0 if due else self.unrefined + 1
         return True
 
     def note(self, skipped: int, gray: Gray) -> None:
@@ -178,8 +202,8 @@ class _Follower:
         for _ in range(skipped):
             self._append(_Alive.none(), float("nan"))
         position = len(self.ids)
-        self._keep(self._small(gray), position)
-        if self._moved_enough():
+        self._keep(shrunk(gray, self.shrink), position)
+        if self._moved_enough(self.alive):
             self._take_up(self.pictures[position], position)
         self._append(self.alive, self._moved)
 
@@ -188,16 +212,10 @@ class _Follower:
         position = len(self.ids)
         if len(self.alive.ids) and self.last not in self.keyframes:
             self.keyframes.append(self.last)
-        self.alive, self.at_keyframe = _Alive.none(), {}
-        self._keep(self._small(gray), position)
+        self.alive, self.at_keyframe = _Alive.none(), _Alive.none()
+        self._keep(shrunk(gray, self.shrink), position)
         self._take_up(self.pictures[position], position)
         self._append(self.alive, float("nan"))
-
-    def _small(self, gray: Gray) -> Gray:
-        if self.shrink == 1.0:
-            return gray
-        size = (round(gray.shape[1] * self.shrink), round(gray.shape[0] * self.shrink))
-        return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _keep(self, gray: Gray, position: int) -> None:
         wanted = set(np.unique(self.alive.origin).tolist())
@@ -218,46 +236,51 @@ class _Follower:
         keyframes = tuple(sorted(ends | set(self.keyframes)))
         return CornerTracks(tuple(self.ids), tuple(self.xy), keyframes, run, np.array(self.flows, np.float32))
 
-    def _followed(self, gray: Gray) -> _Alive:
+    def _flowed(self, gray: Gray) -> _Alive:
+        """Return the corners of the last frame where they are found in this one, and back."""
         s, alive = self.settings, self.alive
         before = as_bright(self.pictures[self.last], gray, s.least_brightening)
-        size, criteria = (s.window_px, s.window_px), (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+        size = (s.window_px, s.window_px)
         xy, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, gray, alive.xy, np.zeros_like(alive.xy), winSize=size, maxLevel=s.levels, criteria=criteria
+            before, gray, alive.xy, np.zeros_like(alive.xy), winSize=size, maxLevel=s.levels, criteria=_CRITERIA
         )
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            gray, before, xy, alive.xy.copy(), winSize=size, maxLevel=1, criteria=criteria,
+            gray, before, xy, alive.xy.copy(), winSize=size, maxLevel=0, criteria=_CRITERIA,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         good = (found.ravel() > 0) & (returned.ravel() > 0)
         good &= np.linalg.norm(back - alive.xy, axis=1) < s.most_back_px
-        refined, smooth = xy.copy(), smoothed(gray)
-        for origin in np.unique(alive.origin[good]).tolist():
-            mine = np.flatnonzero(good & (alive.origin == origin))
+        place = np.asarray(xy, np.float32)
+        return _Alive(alive.ids, place, alive.origin, alive.origin_xy).where(good & _inside(place, gray))
+
+    def _refined(self, found: _Alive, gray: Gray) -> _Alive:
+        """Return the corners where they look most like where they were first seen, without those that do not."""
+        s, xy, smooth = self.settings, found.xy.copy(), smoothed(gray)
+        good, size = np.ones(len(xy), bool), (s.window_px, s.window_px)
+        for origin in np.unique(found.origin).tolist():
             if origin == self.last:
                 continue
             if origin not in self.smooth:
                 self.smooth[origin] = smoothed(self.pictures[origin])
+            mine = np.flatnonzero(found.origin == origin)
             some = mine[:: max(1, len(mine) // s.brightness_samples)]
-            there = np.asarray(xy[some], np.float32)
-            values = values_at(self.smooth[origin], alive.origin_xy[some]), values_at(smooth, there)
+            values = values_at(self.smooth[origin], found.origin_xy[some]), values_at(smooth, found.xy[some])
             first = as_bright(self.pictures[origin], gray, s.least_brightening, values)
-            place, found, difference = cv2.calcOpticalFlowPyrLK(
-                first, gray, alive.origin_xy[mine], xy[mine].copy(), winSize=size, maxLevel=0,
-                criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            place, seen, difference = cv2.calcOpticalFlowPyrLK(
+                first, gray, found.origin_xy[mine], found.xy[mine], winSize=size, maxLevel=0, criteria=_CRITERIA,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             )  # fmt: skip
-            near = np.linalg.norm(place - xy[mine], axis=1) < s.most_creep_px
-            kept = (found.ravel() > 0) & near & (difference.ravel() < s.most_difference)
-            refined[mine], good[mine] = place, kept
-        height, width = gray.shape
-        inside = (refined >= 1).all(axis=1) & (refined[:, 0] < width - 2) & (refined[:, 1] < height - 2)
-        return _Alive(alive.ids, refined.astype(np.float32), alive.origin, alive.origin_xy).where(good & inside)
+            near = np.linalg.norm(place - found.xy[mine], axis=1) < s.most_creep_px
+            xy[mine], good[mine] = place, (seen.ravel() > 0) & near & (difference.ravel() < s.most_difference)
+        return _Alive(found.ids, xy, found.origin, found.origin_xy).where(good & _inside(xy, gray))
 
-    def _moved_enough(self) -> bool:
-        now = {int(i): p for i, p in zip(self.alive.ids, self.alive.xy, strict=True) if int(i) in self.at_keyframe}
-        if len(now) < self.settings.keyframe_survival * len(self.at_keyframe):
+    def _moved_enough(self, now: _Alive) -> bool:
+        """Return whether corners are so far from where the last keyframe saw them, or so few, that one is due."""
+        old = self.at_keyframe
+        _, here, there = np.intersect1d(now.ids, old.ids, assume_unique=True, return_indices=True)
+        if len(here) < self.settings.keyframe_survival * len(old.ids):
             return True
-        moved = np.array([np.hypot(*(p - self.at_keyframe[i])) for i, p in now.items()])
+        moved = np.linalg.norm(now.xy[here] - old.xy[there], axis=1)
         return bool(np.median(moved) > self.settings.keyframe_flow * self.longer)
 
     def _take_up(self, gray: Gray, position: int) -> None:
@@ -286,9 +309,9 @@ class _Follower:
                 np.concatenate([alive.origin_xy, fresh]),
             )
         if len(self.alive.ids) < s.least_corners:
-            self.alive, self.at_keyframe = _Alive.none(), {}
+            self.alive, self.at_keyframe = _Alive.none(), _Alive.none()
             return
         if not len(alive.ids):
             self.run += 1
         self.keyframes.append(position)
-        self.at_keyframe = {int(i): p for i, p in zip(self.alive.ids, self.alive.xy, strict=True)}
+        self.at_keyframe = self.alive

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.ranks import median, quantile
 from list3r.reconstruction.sfm.settings import TurningSettings
 
 Floats = NDArray[np.float64]
@@ -41,7 +42,7 @@ def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settin
     def left(log_ratio: float) -> float:
         focal = 0.5 * (camera.fx + camera.fy) * float(np.exp(log_ratio))
         errors = [_pair_error(a, b, focal, settings) for a, b in centred]
-        return float(np.median(errors)) * 640.0 / longer
+        return median(np.array(errors)) * 640.0 / longer
 
     grid = np.linspace(-1.0, 1.0, 7) * np.log(settings.focal_ratio)
     found = [left(f) for f in grid]
@@ -75,5 +76,5 @@ def _pair_error(a: Floats, b: Floats, focal: float, settings: TurningSettings) -
         seen = rays_a @ R.T
         place = seen[:, :2] / np.maximum(seen[:, 2:], 1e-6) * focal
         off = np.linalg.norm(place - b, axis=1)
-        kept = off <= np.quantile(off, settings.share)
-    return float(np.quantile(off, settings.share))
+        kept = off <= quantile(off, settings.share)
+    return quantile(off, settings.share)
