@@ -246,7 +246,7 @@ class CameraCalibrationSettings:
     """Observations farther from their point's image than this are left out."""
     rounds: int = 3
     """Joint adjustments, each without what the one before contradicts."""
-    settled: float = 1e-6
+    settled: float = 1e-5
     """The last of them ends when a step gains less than this share of the error,"""
     early_settled: float = 1e-3
     """and those before it, which only tell what is contradicted."""
