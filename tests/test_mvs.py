@@ -323,6 +323,13 @@ def test_compiled_path_costs_are_those_of_tensors_to_the_last_bit(shape: tuple[i
     assert (found >= 0).all() and found.std() > 0.1
 
 
+@pytest.mark.parametrize("shape", [(3, 1, 1), (5, 12, 7), (40, 9, 16)])
+def test_the_least_cost_is_found_as_by_tensors_to_the_last_bit(shape: tuple[int, int, int]) -> None:
+    cost = torch.from_numpy(np.random.default_rng(8).integers(0, 9, shape).astype(np.float32) / 8)
+    found, wanted = sweep.below_planes(cost), sweep._below_planes_of_tensors(cost)
+    assert torch.equal(found[0], wanted[0]) and torch.equal(found[1], wanted[1])
+
+
 def test_depth_is_carried_to_where_it_is_seen_and_the_nearest_counts() -> None:
     rng, camera = np.random.default_rng(6), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     inverse = np.where(rng.random((30, 40)) < 0.8, 0.5, 0.0).astype(np.float32)

@@ -160,6 +160,11 @@ def below_planes(cost: Tensor) -> tuple[Tensor, Tensor]:
     if cost.device.type == "cpu":
         found, number = lowest(cost.contiguous().numpy())
         return torch.from_numpy(found), torch.from_numpy(number)
+    return _below_planes_of_tensors(cost)
+
+
+def _below_planes_of_tensors(cost: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the same on an accelerator."""
     best = cost.argmin(dim=0, keepdim=True).clamp(1, cost.shape[0] - 2)
     left, middle, right = (cost.gather(0, best + k)[0] for k in (-1, 0, 1))
     bend = (left - 2.0 * middle + right).clamp_min(1e-6)
