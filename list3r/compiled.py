@@ -2,7 +2,7 @@
 
 Machine code is kept beside the module, or in the user's cache where that cannot be written, so that later processes
 load it. Nothing is reordered (no `fastmath`, one thread), so that results do not depend on how many processes work.
-Dividing by zero gives what NumPy gives, unasked: a loop that would have to ask at each pixel takes one pixel at a time.
+Division by zero gives infinity or NaN, as in NumPy: a check at each pixel would keep loops from taking several at once.
 """
 
 from __future__ import annotations

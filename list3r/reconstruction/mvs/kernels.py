@@ -30,7 +30,7 @@ def zncc_cost(
     total, count = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     inside, sums = np.empty((height, width), np.float32), np.empty((3, height, width), np.float32)
     line, place = np.empty((3, width + 2 * radius), np.float32), np.empty((2, width), np.float32)
-    tried, window = np.empty(width, np.float32), np.empty((3, width), np.float32)
+    tried = np.empty(width, np.float32)
     for d in range(depths.shape[0]):
         total[:] = _ZERO
         count[:] = _ZERO
@@ -40,7 +40,7 @@ def zncc_cost(
                 _place_row(rotated[s], shift[s], v, tried, place, inside)
                 _look_up_row(sources[s], place, line, radius)
                 _row_sums(line, reference, v, radius, sums)
-            _add_zncc(reference, sums, inside, radius, np.float32(noise * noise), window, total)
+            _add_zncc(reference, sums, inside, radius, np.float32(noise * noise), total)
             count += inside
         for v in range(height):
             for u in range(width):
@@ -105,31 +105,35 @@ def _row_sums(line: Floats, reference: Floats, v: int, radius: int, sums: Floats
 
 
 @compiled
-def _add_zncc(
-    reference: Floats, sums: Floats, inside: Floats, radius: int, noise: np.float32, window: Floats, total: Floats
-) -> None:
-    """Add the correlation of windows to a total, where a source sees the place; `window` (3, w) is written over.
+def _add_zncc(reference: Floats, sums: Floats, inside: Floats, radius: int, noise: np.float32, total: Floats) -> None:
+    """Add the correlation of windows to a total, where a source sees the place.
 
     Loops run through rows that were taken out of their arrays before, several pixels at a time.
     """
     _, height, width = reference.shape
-    size = np.float32((2 * radius + 1) ** 2)
+    size, window = np.float32((2 * radius + 1) ** 2), np.empty((3, width), np.float32)
+    ones, squares, products = window[0], window[1], window[2]
     for v in range(height):
         for q in range(3):
-            row, first = window[q], sums[q, max(v - radius, 0)]
-            for u in range(width):
-                row[u] = first[u]
-            for k in range(v - radius + 1, v + radius + 1):
-                more = sums[q, min(max(k, 0), height - 1)]
-                for u in range(width):
-                    row[u] += more[u]
-        ones, squares, products = window[0], window[1], window[2]
+            _column_sums(sums[q], v, radius, window[q])
         mean, spread, seen, out = reference[1, v], reference[2, v], inside[v], total[v]
         for u in range(width):
             own = ones[u] / size
             varied = max(squares[u] / size - own * own, _ZERO) + noise
             cross = products[u] / size - own * mean[u]
             out[u] += cross / np.sqrt(varied * spread[u]) * seen[u]
+
+
+@compiled
+def _column_sums(values: Floats, v: int, radius: int, out: Floats) -> None:
+    """Write sums (w,) over the rows of a window around row v of values (h, w)."""
+    first = values[max(v - radius, 0)]
+    for u in range(len(out)):
+        out[u] = first[u]
+    for k in range(v - radius + 1, v + radius + 1):
+        more = values[min(max(k, 0), len(values) - 1)]
+        for u in range(len(out)):
+            out[u] += more[u]
 
 
 @compiled
