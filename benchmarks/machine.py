@@ -64,15 +64,18 @@ def _end_with_starter() -> None:
 def _watch(process: subprocess.Popen[str]) -> float:
     """Peak of the summed set sizes of a process and its descendants, bytes.
 
-    A look walks through all their pages and holds them up meanwhile: ten times a second cost a fifth of two processors
-    beside a build of 2.5 GB. So there are ten a second at the most, and fewer where they would take 3 % of the time.
+    A look walks through all their pages: ten times a second cost an eighth of two processors beside a build of 2.5 GB.
+    So there are ten a second at the most, and fewer where they would take more than 3 % of a processor's time.
     """
-    peak = 0.0
-    while process.poll() is None:
-        began = time.monotonic()
+    peak, spent = 0.0, time.process_time()
+    while True:
         peak = max(peak, sum(_resident(pid) for pid in [process.pid, *descendants(process.pid)]))
-        time.sleep(max(0.1, 32.0 * (time.monotonic() - began)))
-    return peak
+        before, spent = spent, time.process_time()
+        try:
+            process.wait(max(0.1, 32.0 * (spent - before)))
+            return peak
+        except subprocess.TimeoutExpired:
+            continue
 
 
 def descendants(pid: int) -> list[int]:

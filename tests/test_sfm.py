@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,7 +20,7 @@ from list3r.reconstruction.registry import MODELS, ModelOptions, make_reconstruc
 from list3r.reconstruction.sfm.calibration import calibrate
 from list3r.reconstruction.sfm.mapping import SparseMap, best_of
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
-from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, SfmSettings
+from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, CornerSettings, SfmSettings
 from list3r.reconstruction.sfm.tracks import follow_corners
 from tests.rgbd_scenes import CAMERA, render
 
@@ -170,6 +171,28 @@ def test_corners_do_not_creep():
     seen = (rays * depth[row, column][:, None]) @ T[:3, :3].T + T[:3, 3]
     at = seen[:, :2] / seen[:, 2:] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)
     assert np.median(np.linalg.norm(at - b, axis=1)) < 0.3
+
+
+def test_places_do_not_creep_between_keyframes_though_only_every_third_frame_is_refined():
+    rng = np.random.default_rng(3)
+    scene = cv2.GaussianBlur(rng.uniform(0, 255, (240, 340)), (0, 0), 4.0)
+    scene = (scene - scene.min()) / (scene.max() - scene.min()) * 255
+    grays = []
+    for k in range(60):  # 12 px in all, less than makes a keyframe
+        moved = cv2.warpAffine(scene, np.array([[1.0, 0.0, -0.2 * k], [0.0, 1.0, 0.0]]), (320, 240))
+        grays.append(np.clip(moved + rng.normal(0, 15, moved.shape), 0, 255).astype(np.uint8))
+
+    def creep(every: int) -> float:
+        tracks = follow_corners(grays, CornerSettings(refined_every=every))
+        assert tracks.keyframes == (0, 59)
+        off = []
+        for k in (56, 57, 58):
+            _, a, b = np.intersect1d(tracks.ids[0], tracks.ids[k], return_indices=True)
+            assert len(a) > 100
+            off.append(np.linalg.norm(tracks.xy[k][b] - tracks.xy[0][a] + (0.2 * k, 0.0), axis=1).mean())
+        return max(off)
+
+    assert creep(CornerSettings().refined_every) < 0.5 * creep(1000)
 
 
 def test_the_camera_is_found_and_a_wrong_one_is_doubted():

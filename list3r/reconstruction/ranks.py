@@ -1,6 +1,7 @@
-"""Medians and quantiles of a few hundred known values: those of NumPy, bit for bit, in a tenth of the time.
+"""Medians and quantiles of a few hundred known values: those of NumPy, bit for bit.
 
-NumPy's own ask for much that does not matter here (axes, NaN, kinds of interpolation), thousands of times a chunk.
+NumPy's own ask for much that does not matter here (axes, NaN, kinds of interpolation), thousands of times a chunk. Of
+600 values a quantile takes a sixteenth of their time, a median a sixth, medians of three columns a quarter.
 """
 
 from __future__ import annotations
