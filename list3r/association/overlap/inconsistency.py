@@ -12,7 +12,6 @@ along the ray is measured beside it. Both are held against what the static regio
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,9 +111,12 @@ def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mas
     key = regions.of_pair[pick] * (int(place.max()) + 1) + place.ravel()
     order = np.argsort(key, kind="stable")
     bounds = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1))
-    medians = np.array([np.median(share[pick[order[a:b]]], axis=0) for a, b in pairwise(bounds)])
-    row = regions.of_pair[pick[order[bounds[:-1]]]]
-    return medians.reshape(-1, 3), row, np.diff(bounds).astype(np.float64)
+    start, size = bounds[:-1], np.diff(bounds)
+    medians = np.empty((len(start), 3))
+    for axis in range(3):
+        ascending = share[pick[np.lexsort((share[pick, axis], key))], axis]
+        medians[:, axis] = (ascending[start + (size - 1) // 2] + ascending[start + size // 2]) / 2.0
+    return medians, regions.of_pair[pick[order[start]]], size.astype(np.float64)
 
 
 def _limit(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.association.revisits.keyframe_covariance import with_scale
 from list3r.association.revisits.verification import VerificationSettings, rejected, verify
 from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, umeyama
+from list3r.memory.geometry import Sim3, take, umeyama
 from list3r.memory.records import Edge, Keyframe
 from list3r.reconstruction.features.local import match
 
@@ -82,21 +82,31 @@ def _common_scale(a: Array, b: Array, settings: VerificationSettings) -> float |
     noise = settings.noise.sigma(a[:, 2].astype(np.float32)).astype(np.float64)
     gate = np.maximum(settings.features.gate_least_m, settings.features.gate_sigmas * noise) * settings.scale_gate
     triples = np.random.default_rng(len(a)).integers(0, len(a), (_TRIALS, 3))
-    best, inside = -1.0, np.zeros(len(a), bool)
-    for triple in triples:
-        S = _fit(b[triple], a[triple])
-        if S is None:
-            continue
-        off = np.linalg.norm(S.apply(b) - a, axis=1)
-        score = float(np.maximum(1.0 - off / gate, 0.0).sum())
-        if score > best:
-            best, inside = score, off < gate
+    trials = _similarities(b[triples], a[triples])
+    off = np.linalg.norm(trials.apply(b[None]) - a, axis=2)
+    score = np.maximum(1.0 - off / gate, 0.0).sum(axis=1)
+    inside = off[int(np.argmax(score))] < gate if len(score) else np.zeros(len(a), bool)
     for _ in range(4):
         S = _fit(b[inside], a[inside]) if inside.sum() >= least else None
         if S is None:
             return None
         inside = np.linalg.norm(S.apply(b) - a, axis=1) < gate
     return float(S.scale) if S is not None and inside.sum() >= least else None
+
+
+def _similarities(source: Array, target: Array) -> Sim3:
+    """Return what `umeyama` makes of T triples of points (T, 3, 3), where that is determined and no reflection or
+    collapse."""
+    mean_x, mean_y = source.mean(axis=1), target.mean(axis=1)
+    dx, dy = source - mean_x[:, None], target - mean_y[:, None]
+    spread = np.linalg.svd(dx, compute_uv=False)
+    u, d, vt = np.linalg.svd(np.swapaxes(dy, 1, 2) @ dx)
+    sign = np.ones_like(d)
+    sign[:, 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation, total = (u * sign[:, None]) @ vt, (spread**2).sum(axis=1)
+    scale = (d * sign).sum(axis=1) / np.maximum(total, 1e-300)
+    found = Sim3(scale, rotation, mean_y - scale[:, None] * (rotation @ mean_x[..., None])[..., 0])
+    return take(found, np.flatnonzero((spread[:, 1] >= 1e-9 + 1e-4 * spread[:, 0]) & (scale > 0)))
 
 
 def _fit(source: Array, target: Array) -> Sim3 | None:

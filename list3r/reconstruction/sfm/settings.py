@@ -27,6 +27,13 @@ class CornerSettings:
     """Corners are no nearer to each other, by the longer side (8 px of 640)."""
     window_px: int = 21
     levels: int = 4
+    """Halvings of the picture in which corners are looked for, the smallest first."""
+    near_levels: int = 2
+    """Those after a frame that moved little, from where the same motion leads."""
+    near_flow: float = 0.02
+    """Most that half of the corners then move, by the longer side (13 px of 640)."""
+    least_near: float = 0.9
+    """Where less than this share is found, all levels are looked at after all."""
     refined_every: int = 3
     """Places are refined in every so many frames, and in keyframes."""
     most_creep_px: float = 2.0

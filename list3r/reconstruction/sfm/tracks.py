@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.reconstruction.ranks import median
+from list3r.reconstruction.ranks import median, medians
 from list3r.reconstruction.sfm.settings import CornerSettings
 
 Gray = NDArray[np.uint8]
@@ -176,6 +176,9 @@ class _Follower:
     unrefined: int = 0
     """Frames since the last one in which places were refined."""
     _moved: float = float("nan")
+    """Median motion of the corners to the last frame, by the longer side; NaN where unknown,"""
+    motion: Floats = field(default_factory=lambda: np.zeros(2, np.float32))
+    """and along both axes, px."""
 
     def __post_init__(self) -> None:
         self.shrink = shrinkage(self.shape, self.settings.width)
@@ -194,6 +197,7 @@ class _Follower:
             return False
         moved = found.xy - self.alive.xy[np.searchsorted(self.alive.ids, found.ids)]
         self._moved = float(np.median(np.linalg.norm(moved, axis=1))) / self.longer
+        self.motion = medians(moved)
         self.alive, self.unrefined = found, 0 if due else self.unrefined + 1
         return True
 
@@ -212,7 +216,7 @@ class _Follower:
         position = len(self.ids)
         if len(self.alive.ids) and self.last not in self.keyframes:
             self.keyframes.append(self.last)
-        self.alive, self.at_keyframe = _Alive.none(), _Alive.none()
+        self.alive, self.at_keyframe, self._moved = _Alive.none(), _Alive.none(), float("nan")
         self._keep(shrunk(gray, self.shrink), position)
         self._take_up(self.pictures[position], position)
         self._append(self.alive, float("nan"))
@@ -240,10 +244,19 @@ class _Follower:
         """Return the corners of the last frame where they are found in this one, and back."""
         s, alive = self.settings, self.alive
         before = as_bright(self.pictures[self.last], gray, s.least_brightening)
-        size = (s.window_px, s.window_px)
+        if self._moved <= s.near_flow:
+            near = self._sought(before, gray, alive.xy + self.motion, s.near_levels)
+            if len(near.ids) >= s.least_near * len(alive.ids):
+                return near
+        return self._sought(before, gray, alive.xy, s.levels)
+
+    def _sought(self, before: Gray, gray: Gray, start: Floats, levels: int) -> _Alive:
+        """Return the corners where they are found from a `start` (N, 2), and back."""
+        s, alive, size = self.settings, self.alive, (self.settings.window_px, self.settings.window_px)
         xy, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, gray, alive.xy, np.zeros_like(alive.xy), winSize=size, maxLevel=s.levels, criteria=_CRITERIA
-        )
+            before, gray, alive.xy, start.copy(), winSize=size, maxLevel=levels, criteria=_CRITERIA,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
             gray, before, xy, alive.xy.copy(), winSize=size, maxLevel=0, criteria=_CRITERIA,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
