@@ -121,6 +121,8 @@ class TurningSettings:
     """So many of the matches must be explained."""
     least_matches: int = 20
     """Fewest matches of a pair."""
+    most_pairs: int = 16
+    """About so many pairs at the most are looked at, spread evenly."""
     focal_ratio: float = 1.6
     """Focal lengths that are tried differ from the camera's by no more than this."""
     rounds: int = 3

@@ -55,12 +55,13 @@ def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settin
 def _farthest_pairs(
     places: Places, pairs: Rows, keys: Collection[int], settings: TurningSettings
 ) -> list[tuple[Floats, Floats]]:
-    """Places of what each view shares with the last one that shares enough with it."""
+    """Places of what views spread over the video share with the last one that shares enough with each."""
     last = {}
     for (a, b), rows in sorted(pairs.items()):
         if a in keys and b in keys and len(rows) >= settings.least_matches:
             last[a] = b
     rows_of = [(a, b, pairs[a, b]) for a, b in sorted(last.items())]
+    rows_of = rows_of[:: max(1, len(rows_of) // settings.most_pairs)]
     return [(places[a][r[:, 0]].astype(np.float64), places[b][r[:, 1]].astype(np.float64)) for a, b, r in rows_of]
 
 
