@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from list3r.association.revisits.frame_search import CLASSICAL
-from list3r.reconstruction.features.local import detect
+from list3r.reconstruction.features.local import detect, match
 from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.features.vlad import Vocabulary, describe_frame
 from tests.rgbd_scenes import CAMERA, frames_along, walk
@@ -26,6 +26,17 @@ def test_the_same_place_is_more_alike_than_another() -> None:
     assert np.linalg.norm(here) == pytest.approx(1.0, abs=1e-5)
     assert here @ again > here @ other + 0.1
     assert np.array_equal(here, described(0.0, 0))
+
+
+def test_features_of_a_smaller_picture_lie_where_they_do_in_the_picture() -> None:
+    frame = frames_along(walk(1))[0]
+    assert frame.depth is not None
+    large, small = (detect(frame.color, frame.depth, CAMERA, FeatureSettings(width=w)) for w in (0, 224))
+    pairs = match(large.descriptors, small.descriptors, 0.7)
+    off = small.xy[pairs[:, 1]] - large.xy[pairs[:, 0]]
+    assert len(pairs) > 20
+    assert np.abs(np.median(off, axis=0)).max() < 0.2
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.6
 
 
 def test_a_frame_without_features_has_a_finite_descriptor() -> None:

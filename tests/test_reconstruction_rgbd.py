@@ -15,6 +15,7 @@ from list3r.memory.errors import OptionError, TrackingError
 from list3r.memory.geometry import rotation_exp, umeyama
 from list3r.reconstruction.base import backproject
 from list3r.reconstruction.rgbd.confidence import depth_confidence
+from list3r.reconstruction.rgbd.odometry import CameraTracker
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 from list3r.simulation.dataset import WalkSettings
@@ -104,6 +105,18 @@ def test_a_slow_video_is_followed() -> None:
     result = RgbdReconstructor()(frames_along(poses, step_s=0.5), CAMERA)
     shift, _ = pose_errors(result.T_chunk_cam, poses)
     assert result.posed.all()
+    assert shift.max() < 0.02
+
+
+def test_a_step_that_features_tell_beyond_doubt_is_searched_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every other keyframe and the starts all round cost four times as much and lead to the same place."""
+    asked: list[int] = []
+    guess = CameraTracker._feature_guess
+    monkeypatch.setattr(CameraTracker, "_feature_guess", lambda self, a, b: asked.append(b) or guess(self, a, b))
+    monkeypatch.setattr(CameraTracker, "_sweep", lambda *_: pytest.fail("it was looked for all round"))
+    poses = walk(6, speed=15.0)
+    shift, _ = pose_errors(RgbdReconstructor()(frames_along(poses, step_s=0.5), CAMERA).T_chunk_cam, poses)
+    assert asked == [1, 2, 3, 4, 5]
     assert shift.max() < 0.02
 
 

@@ -46,6 +46,10 @@ class FeaturePose:
 def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: FeatureSettings) -> Features:
     """SIFT features of an RGB image, with the depth found at each."""
     gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    ratio = min(1.0, settings.width / max(gray.shape)) if settings.width else 1.0
+    if ratio < 1.0:
+        size = (round(gray.shape[1] * ratio), round(gray.shape[0] * ratio))
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
     keypoints, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is None:
@@ -53,7 +57,7 @@ def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: Fe
     xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
     response = np.array([k.response for k in keypoints])
     order = np.lexsort((xy[:, 0], xy[:, 1], -response))[: settings.count]
-    xy = xy[order]
+    xy = ((xy[order] + 0.5) / ratio - 0.5).astype(np.float32)
     return Features(xy, descriptors[order].astype(np.uint8), points_at(xy, depth, camera))
 
 

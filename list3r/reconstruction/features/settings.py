@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class FeatureSettings:
     """How local features are found, matched and verified."""
 
+    width: int = 0
+    """Pictures are shrunk to at most this many px on their longer side; 0 for as they are."""
     count: int = 400
     """Most features on a frame."""
     contrast: float = 0.015

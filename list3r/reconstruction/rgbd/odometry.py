@@ -322,17 +322,25 @@ class CameraTracker:
     def _search(self, segment: TrackedSegment, position: int, nearby: bool) -> FrameRegistration | None:
         """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`.
 
-        Raises `_LookCloserError` where frames before it were passed over.
+        Where it is `nearby` the first place by features that leaves no doubt is taken. Raises `_LookCloserError` where
+        frames before it were passed over.
         """
         if self._waiting:
             raise _LookCloserError
         last = max(segment.T_segment_cam)
+        gap_s = self.frames[position].time_s - self.frames[last].time_s
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
-        guesses = [(segment.T_segment_cam[k], self._feature_guess(k, position)) for k in known]
-        starts = [(T_segment_known @ T, False) for T_segment_known, T in guesses if T is not None]
+        placed: list[FrameRegistration | None] = []
+        for k in known:
+            T_known_cam = self._feature_guess(k, position)
+            if T_known_cam is None:
+                continue
+            found = self._place(segment, position, segment.T_segment_cam[k] @ T_known_cam)
+            if nearby and not self._doubtful(segment, found) and self._possible(segment, last, found, gap_s):
+                return found
+            placed.append(found)
         if nearby:
-            starts += [(T, True) for T in self._sweep(segment, last, position)]
-        placed = [self._place(segment, position, T, blind) for T, blind in starts]
+            placed += [self._place(segment, position, T, blind=True) for T in self._sweep(segment, last, position)]
         return max((p for p in placed if p is not None), key=lambda p: p.overlap * p.inliers, default=None)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:

@@ -114,7 +114,7 @@ class OdometrySettings:
     keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     fusion: SurfelSettings = field(default_factory=SurfelSettings)
-    features: FeatureSettings = field(default_factory=FeatureSettings)
+    features: FeatureSettings = field(default_factory=lambda: FeatureSettings(width=448))
     movers: ResidualMoverSettings = field(default_factory=ResidualMoverSettings)
     prior: PriorSettings = field(default_factory=PriorSettings)
     """Of poses that the source gives as a prior."""
