@@ -57,7 +57,7 @@ def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: Fe
     xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
     response = np.array([k.response for k in keypoints])
     order = np.lexsort((xy[:, 0], xy[:, 1], -response))[: settings.count]
-    xy = ((xy[order] + 0.5) / ratio - 0.5).astype(np.float32)
+    xy = xy[order] if ratio == 1.0 else ((xy[order] + 0.5) / ratio - 0.5).astype(np.float32)
     return Features(xy, descriptors[order].astype(np.uint8), points_at(xy, depth, camera))
 
 

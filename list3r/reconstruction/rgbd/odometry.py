@@ -10,7 +10,7 @@ is left out (decision 0063).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -75,6 +75,8 @@ class CameraTracker:
         self._prior, self._between = prior, frozenset(between)
         self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
+        steps = np.diff([frame.time_s for frame in frames])
+        self._apart = bool(len(steps) and np.median(steps) > settings.gap_s)
         self._views: dict[int, WorkingFrame] = {}
         self._mover_masks: dict[int, Mask] = {}
         self._unsure: set[int] = set()
@@ -136,7 +138,10 @@ class CameraTracker:
         if position not in self._features:
             frame = self.frames[position]
             assert frame.depth is not None
-            self._features[position] = detect(frame.color, frame.depth, self.camera, self.settings.features)
+            settings = self.settings.features
+            if self._apart:
+                settings = replace(settings, width=self.settings.feature_width)
+            self._features[position] = detect(frame.color, frame.depth, self.camera, settings)
         return self._features[position]
 
     def _step(self, position: int) -> None:
@@ -218,7 +223,8 @@ class CameraTracker:
             else:
                 found.append(self._search(segment, position, nearby=True))
         else:
-            found.append(self._search(segment, position, nearby=gap_s <= self.settings.most_gap_s))
+            nearby = gap_s <= self.settings.most_gap_s
+            found.append(self._search(segment, position, nearby, frugal=nearby))
         possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
         if given is not None and possible:
             possible = [f for f in possible if self._believed(segment, given, f)]
@@ -319,28 +325,30 @@ class CameraTracker:
             and angle_deg(step) <= self.settings.most_turn_deg_per_s * gap_s
         )
 
-    def _search(self, segment: TrackedSegment, position: int, nearby: bool) -> FrameRegistration | None:
+    def _search(
+        self, segment: TrackedSegment, position: int, nearby: bool, frugal: bool = False
+    ) -> FrameRegistration | None:
         """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`.
 
-        Where it is `nearby` the first place by features that leaves no doubt is taken. Raises `_LookCloserError` where
-        frames before it were passed over.
+        A `frugal` search takes the first place by features that leaves no doubt. Raises `_LookCloserError` where frames
+        before it were passed over.
         """
         if self._waiting:
             raise _LookCloserError
         last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
+        guesses = ((segment.T_segment_cam[k], self._feature_guess(k, position)) for k in known)
+        starts = ((T_segment_known @ T, False) for T_segment_known, T in guesses if T is not None)
         placed: list[FrameRegistration | None] = []
-        for k in known:
-            T_known_cam = self._feature_guess(k, position)
-            if T_known_cam is None:
-                continue
-            found = self._place(segment, position, segment.T_segment_cam[k] @ T_known_cam)
-            if nearby and not self._doubtful(segment, found) and self._possible(segment, last, found, gap_s):
-                return found
-            placed.append(found)
+        for T, _ in starts if frugal else ():
+            placed.append(self._place(segment, position, T))
+            if not self._doubtful(segment, placed[-1]) and self._possible(segment, last, placed[-1], gap_s):
+                return placed[-1]
+        others = list(starts)
         if nearby:
-            placed += [self._place(segment, position, T, blind=True) for T in self._sweep(segment, last, position)]
+            others += [(T, True) for T in self._sweep(segment, last, position)]
+        placed += [self._place(segment, position, T, blind) for T, blind in others]
         return max((p for p in placed if p is not None), key=lambda p: p.overlap * p.inliers, default=None)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:

@@ -97,6 +97,8 @@ class OdometrySettings:
     """Frames further apart than this are searched for by features only."""
     short_segment: int = 5
     """Frames after which a new segment stands on its own."""
+    feature_width: int = 448
+    """Width of the pictures whose features are compared where most frames lie so far apart, px."""
     search_keyframes: int = 6
     """Most keyframes whose features are compared in a search."""
     sweep_samples: int = 800
@@ -114,7 +116,7 @@ class OdometrySettings:
     keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     fusion: SurfelSettings = field(default_factory=SurfelSettings)
-    features: FeatureSettings = field(default_factory=lambda: FeatureSettings(width=448))
+    features: FeatureSettings = field(default_factory=FeatureSettings)
     movers: ResidualMoverSettings = field(default_factory=ResidualMoverSettings)
     prior: PriorSettings = field(default_factory=PriorSettings)
     """Of poses that the source gives as a prior."""
