@@ -53,7 +53,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         colour = colour_only(Path(scratch) / "colour", names) if args.colour_only else None
         options = ["--workers", "2", "--force", *_options(args)]
-        for name, root in roots.items():
+        for root in roots.values():
             run_from(root, colour or args.source.resolve(), Path(scratch) / "few.l3r", [*options, "--frames", FEW])
         for _ in range(args.rounds):
             for name, root in roots.items():
@@ -97,7 +97,9 @@ def _figures(memory: Path, source: Path, truth: Trajectory | None, count: int) -
         opened.export("json", str(exported))
     things = [e for e in read_scene(exported)["instances"] if not e["structure"]]
     with Store.open(memory) as store:
-        poses = {f.frame_index: (np.asarray(S.rotation), np.asarray(S.translation)) for f, S in store.trajectory.poses()}
+        poses = {
+            f.frame_index: (np.asarray(S.rotation), np.asarray(S.translation)) for f, S in store.trajectory.poses()
+        }
     if truth is None:
         errors, _ = run_list3r("eval", "trajectory", str(source), str(memory))
         error = errors["ate_se3_m"]["rmse"]
