@@ -23,7 +23,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from machine import machine, run_list3r, write_json
 from sfm import colour_only, read_truth, sim3_error
 
@@ -84,7 +83,9 @@ def run_from(root: Path, source: Path, memory: Path, options: list[str]) -> dict
     before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     words = [sys.executable, "-m", "list3r", "build", str(source), "-m", str(memory), *options]
     environment = os.environ | {"PYTHONPATH": str(root)}
-    subprocess.run(words, cwd=root, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = subprocess.run(words, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{root.name}: list3r build ended with status {done.returncode}: {done.stderr[-500:]}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return {"wall_s": round(time.monotonic() - started, 1), "cpu_s": round(cpu, 1)}
@@ -97,9 +98,7 @@ def _figures(memory: Path, source: Path, truth: Trajectory | None, count: int) -
         opened.export("json", str(exported))
     things = [e for e in read_scene(exported)["instances"] if not e["structure"]]
     with Store.open(memory) as store:
-        poses = {
-            f.frame_index: (np.asarray(S.rotation), np.asarray(S.translation)) for f, S in store.trajectory.poses()
-        }
+        poses = {f.frame_index: (S.rotation, S.translation) for f, S in store.trajectory.poses()}
     if truth is None:
         errors, _ = run_list3r("eval", "trajectory", str(source), str(memory))
         error = errors["ate_se3_m"]["rmse"]

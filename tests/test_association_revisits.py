@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from benchmarks.peers.paper_loops import PaperRevisitSettings, loops_by_score
 from list3r.association.revisits.frame_search import TRAINED, SearchSettings, choose
-from list3r.association.revisits.scaled_verification import verify_scaled
+from list3r.association.revisits.scaled_verification import _fit, _similarities, verify_scaled
 from list3r.association.revisits.search import RevisitSettings, find_loops
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.memory.geometry import Sim3
@@ -238,6 +238,17 @@ def rescaled(keyframe: Keyframe, factor: float) -> Keyframe:
     T[:3, 3] *= factor
     points, depth = keyframe.points_cam * np.float32(factor), keyframe.depth_small * np.float32(factor)
     return replace(keyframe, T_chunk_cam=T, points_cam=points, depth_small=depth)
+
+
+def test_triples_give_the_similarities_that_each_gives_by_itself() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 60, 3))
+    a[:3] = a[0]
+    triples = np.concatenate([[(0, 1, 2)], rng.integers(0, 60, (300, 3))])  # some determine nothing, one a collapse
+    alone = [S for S in (_fit(b[t], a[t]) for t in triples) if S is not None]
+    together = _similarities(b[triples], a[triples])
+    assert len(alone) < len(triples)
+    assert np.allclose(together.as_matrix(), [S.as_matrix() for S in alone], atol=1e-9)
 
 
 def test_loops_are_found_among_stored_chunks(here: Keyframe, again: Keyframe) -> None:

@@ -195,6 +195,24 @@ def test_places_do_not_creep_between_keyframes_though_only_every_third_frame_is_
     assert creep(CornerSettings().refined_every) < 0.5 * creep(1000)
 
 
+def test_corners_are_followed_on_few_levels_as_on_all_and_a_jerk_is_caught():
+    rng = np.random.default_rng(5)
+    scene = sum(k * cv2.GaussianBlur(rng.uniform(-1, 1, (300, 660)), (0, 0), k) for k in (1.5, 4.0, 12.0, 30.0))
+    scene = (scene - scene.min()) / (scene.max() - scene.min()) * 255
+    place = np.cumsum([0.0, *[2.0] * 6, 70.0, *[2.0] * 4])  # px
+    grays = [
+        np.clip(cv2.warpAffine(scene, np.array([[1.0, 0.0, -x], [0.0, 1.0, -20.0]]), (480, 260)), 0, 255).astype(
+            np.uint8
+        )
+        for x in place
+    ]
+    few, all_ = (follow_corners(grays, CornerSettings(near_flow=f)) for f in (CornerSettings().near_flow, -1.0))
+    for k in range(1, len(grays)):
+        _, a, b = np.intersect1d(few.ids[k], all_.ids[k], return_indices=True)
+        assert len(a) > 0.95 * len(all_.ids[k]) > 50
+        assert np.quantile(np.linalg.norm(few.xy[k][a] - all_.xy[k][b], axis=1), 0.95) < 0.05
+
+
 def test_the_camera_is_found_and_a_wrong_one_is_doubted():
     settings = SfmSettings(calibration=CameraCalibrationSettings(windows=1, frames=FRAMES))
     found = calibrate(Held(walk(), None), settings)

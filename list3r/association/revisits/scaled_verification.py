@@ -16,7 +16,7 @@ from list3r.association.revisits.verification import VerificationSettings, rejec
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3, take, umeyama
 from list3r.memory.records import Edge, Keyframe
-from list3r.reconstruction.features.local import match
+from list3r.reconstruction.features.local import match, rigid_fits
 
 Array = NDArray[np.float64]
 
@@ -95,17 +95,12 @@ def _common_scale(a: Array, b: Array, settings: VerificationSettings) -> float |
 
 
 def _similarities(source: Array, target: Array) -> Sim3:
-    """Return what `umeyama` makes of T triples of points (T, 3, 3), where that is determined and no reflection or
-    collapse."""
-    mean_x, mean_y = source.mean(axis=1), target.mean(axis=1)
-    dx, dy = source - mean_x[:, None], target - mean_y[:, None]
-    spread = np.linalg.svd(dx, compute_uv=False)
-    u, d, vt = np.linalg.svd(np.swapaxes(dy, 1, 2) @ dx)
-    sign = np.ones_like(d)
-    sign[:, 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    rotation, total = (u * sign[:, None]) @ vt, (spread**2).sum(axis=1)
-    scale = (d * sign).sum(axis=1) / np.maximum(total, 1e-300)
-    found = Sim3(scale, rotation, mean_y - scale[:, None] * (rotation @ mean_x[..., None])[..., 0])
+    """Return what `umeyama` makes of T triples of points (T, 3, 3), where that is determined and no collapse."""
+    mean_x, mean_y = source.mean(axis=1, keepdims=True), target.mean(axis=1, keepdims=True)
+    dx, dy = source - mean_x, target - mean_y
+    spread, (R, _) = np.linalg.svd(dx, compute_uv=False), rigid_fits(source, target)
+    scale = np.einsum("tni,tij,tnj->t", dy, R, dx) / np.maximum((spread**2).sum(axis=1), 1e-300)
+    found = Sim3(scale, R, mean_y[:, 0] - scale[:, None] * (R @ mean_x[:, 0, :, None])[..., 0])
     return take(found, np.flatnonzero((spread[:, 1] >= 1e-9 + 1e-4 * spread[:, 0]) & (scale > 0)))
 
 

@@ -45,20 +45,30 @@ class FeaturePose:
 
 def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: FeatureSettings) -> Features:
     """SIFT features of an RGB image, with the depth found at each."""
-    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-    ratio = min(1.0, settings.width / max(gray.shape)) if settings.width else 1.0
-    if ratio < 1.0:
-        size = (round(gray.shape[1] * ratio), round(gray.shape[0] * ratio))
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    gray = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.uint8)
+    factor = shrinkage(gray.shape, settings.width) if settings.width else 1.0
     sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
-    keypoints, descriptors = sift.detectAndCompute(gray, None)
+    keypoints, descriptors = sift.detectAndCompute(shrunk(gray, factor), None)
     if descriptors is None:
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
     xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
     response = np.array([k.response for k in keypoints])
     order = np.lexsort((xy[:, 0], xy[:, 1], -response))[: settings.count]
-    xy = xy[order] if ratio == 1.0 else ((xy[order] + 0.5) / ratio - 0.5).astype(np.float32)
+    xy = xy[order] if factor == 1.0 else ((xy[order] + 0.5) / factor - 0.5).astype(np.float32)
     return Features(xy, descriptors[order].astype(np.uint8), points_at(xy, depth, camera))
+
+
+def shrinkage(shape: tuple[int, ...], width: int) -> float:
+    """Return the factor by which a picture (h, w) is shrunk so that its longer side is `width` px at the most."""
+    return min(1.0, width / max(shape))
+
+
+def shrunk(gray: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    """Return a picture shrunk by a factor. A place x of it is (x + 0.5) / factor - 0.5 of the picture."""
+    if factor == 1.0:
+        return gray
+    size = (round(gray.shape[1] * factor), round(gray.shape[0] * factor))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def points_at(xy: Floats, depth: Floats, camera: Camera) -> Floats:
@@ -119,7 +129,7 @@ def relative_pose(
     farther = np.maximum(a[:, 2], b[:, 2]).astype(np.float32)
     gate = np.maximum(settings.gate_least_m, settings.gate_sigmas * noise.sigma(farther)).astype(np.float64)
     triples = np.random.default_rng(len(a)).integers(0, len(a), (settings.trials, 3))
-    R, t = _kabsch(b[triples], a[triples])
+    R, t = rigid_fits(b[triples], a[triples])
     errors = np.linalg.norm(np.einsum("tij,nj->tni", R, b) + t[:, None] - a, axis=-1)
     best = int((np.minimum(errors / gate, 1.0)).sum(axis=1).argmin())
     inside = errors[best] < gate
@@ -127,14 +137,14 @@ def relative_pose(
         if inside.sum() < settings.least_pairs:
             return None
         weight = inside / gate**2
-        R1, t1 = _kabsch(b[None], a[None], weight[None])
+        R1, t1 = rigid_fits(b[None], a[None], weight[None])
         inside = np.linalg.norm(b @ R1[0].T + t1[0] - a, axis=-1) < gate
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R1[0], t1[0]
     return FeaturePose(T, len(a), int(inside.sum())) if inside.sum() >= settings.least_pairs else None
 
 
-def _kabsch(
+def rigid_fits(
     source: NDArray[np.float64], target: NDArray[np.float64], weight: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rigid transforms of B point sets of n points each. Shapes (B, n, 3) -> (B, 3, 3), (B, 3)."""

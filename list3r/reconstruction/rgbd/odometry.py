@@ -339,16 +339,16 @@ class CameraTracker:
         gap_s = self.frames[position].time_s - self.frames[last].time_s
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
         guesses = ((segment.T_segment_cam[k], self._feature_guess(k, position)) for k in known)
-        starts = ((T_segment_known @ T, False) for T_segment_known, T in guesses if T is not None)
+        starts = (T_segment_known @ T for T_segment_known, T in guesses if T is not None)
         placed: list[FrameRegistration | None] = []
-        for T, _ in starts if frugal else ():
+        for T in starts if frugal else ():
             placed.append(self._place(segment, position, T))
             if not self._doubtful(segment, placed[-1]) and self._possible(segment, last, placed[-1], gap_s):
                 return placed[-1]
-        others = list(starts)
-        if nearby:
-            others += [(T, True) for T in self._sweep(segment, last, position)]
-        placed += [self._place(segment, position, T, blind) for T, blind in others]
+        left = list(starts)  # before any is placed, which takes what moves out of the frame
+        blind = self._sweep(segment, last, position) if nearby else []
+        placed += [self._place(segment, position, T) for T in left]
+        placed += [self._place(segment, position, T, blind=True) for T in blind]
         return max((p for p in placed if p is not None), key=lambda p: p.overlap * p.inliers, default=None)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:

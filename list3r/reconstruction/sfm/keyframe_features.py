@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.features.learned import LearnedDetector
-from list3r.reconstruction.features.local import LEARNED_RATIO, nearest_pairs
+from list3r.reconstruction.features.local import LEARNED_RATIO, nearest_pairs, shrinkage, shrunk
 from list3r.reconstruction.features.vlad import root_sift
 from list3r.reconstruction.sfm.settings import FinderSettings
-from list3r.reconstruction.sfm.tracks import shrinkage, shrunk
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.reconstruction.features.local import shrinkage, shrunk
 from list3r.reconstruction.ranks import median, medians
 from list3r.reconstruction.sfm.settings import CornerSettings
 
@@ -98,19 +99,6 @@ _LEAST_USABLE = 12
 """Fewest values that tell how brightness changed."""
 _GAINS = (0.25, 4.0)
 """Changes of contrast that are believed."""
-
-
-def shrinkage(shape: tuple[int, ...], width: int) -> float:
-    """Return the factor by which a picture (h, w) is shrunk so that its longer side is `width` px at the most."""
-    return min(1.0, width / max(shape))
-
-
-def shrunk(gray: Gray, factor: float) -> Gray:
-    """Return a picture shrunk by a factor. A place x of it is (x + 0.5) / factor - 0.5 of the picture."""
-    if factor == 1.0:
-        return gray
-    size = (round(gray.shape[1] * factor), round(gray.shape[0] * factor))
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def smoothed(gray: Gray) -> Gray:
