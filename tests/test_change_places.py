@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
-from list3r.memory.geometry import Sim3
+from list3r.memory.change.places import Places
+from list3r.memory.geometry import Sim3, rotation_exp
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.merging.edges import pair_scores
 from list3r.memory.overlap.summaries import chunk_summaries
-from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, seen_through_share, tally
+from list3r.memory.overlap.visibility import (
+    UNTOLD,
+    DepthView,
+    VisibilitySettings,
+    in_sight_of,
+    point_visibility,
+    seen_through_share,
+    tally,
+)
 from list3r.memory.records import Edge
 from list3r.memory.store.store import Store
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
@@ -40,6 +49,21 @@ def test_a_point_counts_the_frames_that_see_it_and_that_see_through_it() -> None
 @pytest.mark.parametrize(("depths", "share"), [((2.0, 2.01), 0.0), ((2.6, 2.6), 1.0), ((1.2, 0.0), None), ((), None)])
 def test_a_surface_is_seen_through_or_not_or_nothing_is_told(depths: tuple[float, ...], share: float | None) -> None:
     assert seen_through_share(_patch(), [_view(d, k) for k, d in enumerate(depths)], S) == share
+
+
+def test_what_a_view_tells_lies_in_what_it_can_see() -> None:
+    rng = np.random.default_rng(5)
+    told, points = 0, rng.uniform(-6.0, 6.0, (4000, 3))
+    for _ in range(12):
+        S_cam_world = Sim3(np.array(rng.uniform(0.5, 2.0)), rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+        picture = rng.choice([0.0, 1.0, 9.0], (120, 160), p=[0.1, 0.1, 0.8]).astype(np.float32)
+        view = DepthView(1, 0, S_cam_world, float(rng.uniform(0.5, 2.0)), picture, (130.0, 130.0, 79.5, 59.5))
+        ((low, high),) = in_sight_of([view], S)
+        known = point_visibility(points, view, S) != UNTOLD
+        told += int(known.sum())
+        assert ((points[known] >= low) & (points[known] <= high)).all()
+    assert told > 200
+    assert in_sight_of([], S).shape == (0, 2, 3)
 
 
 def _two(path: Path, second: dict[str, Box], first: dict[str, Box] | None = None) -> Path:
@@ -75,6 +99,37 @@ def test_nothing_has_moved_by_what_the_sessions_may_lie_off_each_other(tmp_path:
     assert _tied(tmp_path / "sure.l3r", moved, (0.01, 0.01, 0.01)) == ["moved"]
     assert _tied(tmp_path / "across.l3r", moved, (0.01, 0.2, 0.01)) == ["moved"]
     assert _tied(tmp_path / "along.l3r", moved, (0.2, 0.01, 0.01)) == []
+
+
+def test_what_is_far_off_is_not_asked_about_and_what_is_told_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second session that sees only the table tells nothing of a stool that is behind it."""
+    moved = {**_without("red"), "blue": Box((0.6, 0.0, 0.80), ROOM["blue"].size, ROOM["blue"].rgb)}
+    asked: list[bool] = []
+    short = Places.out_of_sight
+
+    def noted(places: Places, n: int, session: int) -> bool:
+        asked.append(short(places, n, session))
+        return asked[-1]
+
+    monkeypatch.setattr(Places, "out_of_sight", noted)
+    told = []
+    for name, always in (("short", False), ("long", True)):
+        if always:
+            monkeypatch.setattr(Places, "out_of_sight", lambda *_: False)
+            monkeypatch.setattr(Places, "far_apart", lambda *_: False)
+        with Store.create(tmp_path / f"{name}.l3r") as store:
+            for room, target in ((dict(ROOM), TABLE), (dict(ROOM), (0.0, 2.6, 0.3)), (moved, TABLE)):
+                with store.transaction():
+                    add_session(store, room, np.concatenate([cameras(target, 0.4, 0.4), cameras(target, 0.5, 0.4)]))
+                    place_together(store)
+                    consolidate(store)
+            told.append([(e.session_id, e.instance_id, e.kind, e.reason) for e in store.events.all()])
+            told.append([i.state for i in store.instances.all()])
+    assert told[:2] == told[2:]
+    assert {kind for _, _, kind, _ in told[0]} >= {"moved", "removed"}
+    assert True in asked
 
 
 def test_what_is_gone_is_gone_wherever_the_sessions_may_lie(tmp_path: Path) -> None:

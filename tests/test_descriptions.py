@@ -8,6 +8,7 @@ import pytest
 from list3r.memory.description.colors import (
     Reference,
     color_name,
+    color_names,
     color_words,
     dominant_colors,
     lab_from_rgb,
@@ -73,22 +74,30 @@ def test_a_room_without_anything_neutral_corrects_nothing() -> None:
 
 def test_the_commonest_colour_counts_not_the_mixture_of_all() -> None:
     swatches = dominant_colors(points_of(((196, 52, 44), 300), ((40, 92, 168), 180), ((30, 30, 30), 60)))
-    assert main_color(swatches)[0] == "red"
+    assert main_color(swatches, color_names(swatches))[0] == "red"
     assert sum(s.share for s in swatches) <= 1.0 + 1e-9
     assert [s.share for s in swatches] == sorted((s.share for s in swatches), reverse=True)
 
 
 def test_shadow_gives_way_to_what_is_lit() -> None:
-    assert main_color(dominant_colors(points_of(((20, 18, 18), 220), ((150, 95, 55), 180))))[0] == "brown"
-    assert main_color(dominant_colors(points_of(((20, 18, 18), 400))))[0] == "black"
+    lit, dark = (
+        dominant_colors(points_of(((20, 18, 18), 220), ((150, 95, 55), 180))),
+        dominant_colors(points_of(((20, 18, 18), 400))),
+    )
+    assert main_color(lit, color_names(lit))[0] == "brown"
+    assert main_color(dark, color_names(dark))[0] == "black"
 
 
 def test_two_colours_are_named_only_where_both_are_clear() -> None:
     red, white = (196, 40, 40), (240, 240, 240)
-    assert color_words(dominant_colors(points_of((red, 220), (white, 180)))) == "red and white"
-    assert color_words(dominant_colors(points_of((red, 360), (white, 60)))) == "red"
-    assert color_words(dominant_colors(points_of(((120, 120, 120), 220), ((190, 190, 190), 180)))) == "grey"
-    assert color_words(dominant_colors(np.zeros((0, 3), np.uint8))) == "grey"
+    seen = {
+        "red and white": points_of((red, 220), (white, 180)),
+        "red": points_of((red, 360), (white, 60)),
+        "grey": points_of(((120, 120, 120), 220), ((190, 190, 190), 180)),
+    }
+    for words, points in (*seen.items(), ("grey", np.zeros((0, 3), np.uint8))):
+        swatches = dominant_colors(points)
+        assert color_words(swatches, color_names(swatches)) == words
 
 
 def cylinder(radius: float, height: float, arc: float, noise: float = 0.002) -> np.ndarray:

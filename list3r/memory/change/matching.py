@@ -122,6 +122,9 @@ class ChangeMatching:
         """Return what frames tell about the place of an instance that was not found again, if it is gone from there."""
         p = self._p
         placed.state = "unseen"
+        fresh = [m for m in fresh if not p.far_apart(placed.now, m)]
+        if not fresh and p.out_of_sight(placed.now, session):
+            return None
         if not self._movable[placed.now] or p.frames(placed.now, session) < self._s.least_frames:
             return None
         found = p.look_after(placed.now, session)

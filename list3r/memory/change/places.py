@@ -27,6 +27,7 @@ from list3r.memory.overlap.visibility import (
     DepthView,
     PlaceVisibility,
     changed_points,
+    in_sight_of,
     place_visibility,
     seen_through_share,
     tally,
@@ -87,6 +88,10 @@ class Places:
         self._views: dict[tuple[int, int], list[DepthView]] = {}
         self._light: dict[int, LightBetween] = {}
         self._share: dict[tuple[Key, int, bool], float] = {}
+        self._extents: dict[int, Array] = {}
+        self._sights: dict[tuple[int, int], Array] = {}
+        self._stayed: dict[tuple[int, int], OrientedBox] = {}
+        self._frames: dict[tuple[int, int], int] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
@@ -94,13 +99,13 @@ class Places:
         """Return members of the last session before, or of this one; those that tell of the change, if it has not
         `stayed`.
         """
-        owner = [self.rows[k].session_id for k, _ in self.groups[n]]
-        wanted = session
-        if before:
-            earlier = [s for s in owner if s < session]
-            wanted = max(earlier) if earlier else session
-        inside = [k for k, s in zip(self.groups[n], owner, strict=True) if s == wanted]
+        wanted = self._told_by(n, session, before=before)
+        inside = [k for k in self.groups[n] if self.rows[k[0]].session_id == wanted]
         return inside if stayed else self._pure(n, inside, session, before=before)
+
+    def _told_by(self, n: int, session: int, *, before: bool) -> int:
+        """Return the last session before that saw an instance, or this one."""
+        return max((s for s in self.sessions[n] if s < session), default=session) if before else session
 
     def _pure(self, n: int, members: list[Key], session: int, *, before: bool) -> list[Key]:
         """Return those that hold least of what stayed, where what they show has changed: not what is mixed with a
@@ -129,12 +134,47 @@ class Places:
 
     def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
         """Return the box of what was seen of it; unless it has stayed, of what of that has changed."""
-        points = self.points(n, session, before=before, stayed=stayed)
-        if not stayed:
-            views = self._views_across(n, session, before=before)
-            points = self._with_foot(points, self._changed_rows(points, views))
+        if stayed:
+            name = n, self._told_by(n, session, before=before)
+            if name not in self._stayed:
+                self._stayed[name] = self._box_of(n, self.points(n, session, before=before, stayed=True))
+            return self._stayed[name]
+        points = self.points(n, session, before=before)
+        views = self._views_across(n, session, before=before)
+        return self._box_of(n, self._with_foot(points, self._changed_rows(points, views)))
+
+    def _box_of(self, n: int, points: Array) -> OrientedBox:
         upright = self._upright and self.component[n] == self._first
         return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
+
+    def out_of_sight(self, n: int, session: int) -> bool:
+        """Return whether no frame of a session can tell about any surface of an instance."""
+        name = session, self.component[n]
+        if name not in self._sights:
+            self._sights[name] = in_sight_of(self._views_of(*name), self._s.visibility)
+        low, high = self.extent(n)
+        sights = self._sights[name]
+        return not bool(np.all((sights[:, 0] <= high) & (sights[:, 1] >= low), axis=1).any())
+
+    def far_apart(self, n: int, m: int) -> bool:
+        """Return whether two instances lie so far apart that no surface of `n` meets `m`, or lies in the box of `m`.
+
+        The box of some points reaches beyond them by less than twice the diagonal of their extent.
+        """
+        a, b = self.extent(n), self.extent(m)
+        meets = max(self._s.meets_m, self._s.replaced_link_m) * self.unit
+        reach = 2.0 * np.linalg.norm(b[1] - b[0]) + meets
+        return bool(np.any((a[0] > b[1] + reach) | (a[1] < b[0] - reach)))
+
+    def extent(self, n: int) -> Array:
+        """Return the box round all that was ever seen of an instance, world coordinates; NaN where there is nothing.
+        Shape (2, 3).
+        """
+        if n not in self._extents:
+            points = np.concatenate([self._points_of(key) for key in self.groups[n]])
+            found = [points.min(axis=0), points.max(axis=0)] if len(points) else np.full((2, 3), np.nan)
+            self._extents[n] = np.array(found)
+        return self._extents[n]
 
     def inside(self, n: int, box: OrientedBox, slack_m: float, session: int, *, before: bool) -> float:
         """Return the share of its surface points that lie in a box."""
@@ -308,8 +348,10 @@ class Places:
 
     def frames_in(self, n: int, session: int) -> int:
         """Return frames of one session's recording in which an instance was seen."""
-        own = [self.shapes[k].stands_for for k, _ in self.groups[n] if self.rows[k].session_id == session]
-        return max(own, default=1) * len({f for _, f in self._sightings(n, session)})
+        if (n, session) not in self._frames:
+            own = [self.shapes[k].stands_for for k, _ in self.groups[n] if self.rows[k].session_id == session]
+            self._frames[n, session] = max(own, default=1) * len({f for _, f in self._sightings(n, session)})
+        return self._frames[n, session]
 
     def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
         """Return the frames of a session that see most of an instance."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -108,27 +109,28 @@ def dominant_colors(rgb: NDArray[np.uint8], most: int = 3) -> tuple[Swatch, ...]
     return tuple(out)
 
 
-def main_color(swatches: Sequence[Swatch], reference: Reference | None = None) -> tuple[str, tuple[int, int, int]]:
-    """Return (name, RGB as seen) of the colour that most of an instance has, shades of one name counted together."""
-    return _main_of(swatches, color_names(swatches, reference))
-
-
 def color_names(swatches: Sequence[Swatch], reference: Reference | None = None) -> list[str]:
     """Return the name of each colour of an instance."""
     return [color_name(s.lab, reference) for s in swatches]
 
 
-def _main_of(swatches: Sequence[Swatch], names: Sequence[str]) -> tuple[str, tuple[int, int, int]]:
+def main_color(swatches: Sequence[Swatch], names: Sequence[str]) -> tuple[str, tuple[int, int, int]]:
+    """Return (name, RGB as seen) of the colour that most of an instance has, shades of one name counted together.
+
+    `names` are the `color_names` of the swatches.
+    """
     weight = [s.share * (_DARK_WEIGHT if s.lab[0] < _DARK_L else 1.0) for s in swatches]
     total = {n: sum(w for m, w in zip(names, weight, strict=True) if m == n) for n in names}
     best = max(range(len(names)), key=lambda k: (total[names[k]], weight[k], -k))
     return names[best], swatches[best].rgb
 
 
-def color_words(swatches: Sequence[Swatch], reference: Reference | None = None) -> str:
-    """Return the name of the main colour, or "red and white" where two clearly different ones share an instance."""
-    names = color_names(swatches, reference)
-    name, _ = _main_of(swatches, names)
+def color_words(swatches: Sequence[Swatch], names: Sequence[str]) -> str:
+    """Return the name of the main colour, or "red and white" where two clearly different ones share an instance.
+
+    `names` are the `color_names` of the swatches.
+    """
+    name, _ = main_color(swatches, names)
     share = dict.fromkeys(names, 0.0)
     for s, n in zip(swatches, names, strict=True):
         share[n] += s.share
@@ -161,7 +163,7 @@ _HUES = (
 def color_name(lab: Sequence[float], reference: Reference | None = None) -> str:
     """Return the everyday name of one colour, CIE L*a*b* as seen, in the light of the reference."""
     light, a, b = (reference or Reference()).corrected(lab)
-    chroma, hue = float(np.hypot(a, b)), float(np.degrees(np.arctan2(b, a)) % 360.0)
+    chroma, hue = math.hypot(a, b), math.degrees(math.atan2(b, a)) % 360.0
     if (light < 14.0 and chroma < 20.0) or chroma < _least_chroma(light, hue):
         return _grey(light)
     if 300.0 <= hue < 310.0 and chroma > 50.0:

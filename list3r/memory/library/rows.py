@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.colors import Swatch, color_words, main_color
+from list3r.memory.description.colors import Swatch, color_names, color_words, main_color
 from list3r.memory.description.describe import describe
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.geometry import Array, OrientedBox, Sim3, rotation_exp, stack
@@ -50,11 +50,12 @@ def record_of(
     """Return the record of an instance, where its chunks are settled."""
     geometry: InstanceGeometry = found.geometry
     seen = [times[s, f] for s, f in found.frames.tolist() if (s, f) in times] or [0.0]
-    name, rgb = main_color(found.swatches, world.light)
+    names = color_names(found.swatches, world.light)
+    name, rgb = main_color(found.swatches, names)
     return Instance(
         id=geometry.id,
         label=label,
-        description=_description(found, geometry.box.size, geometry.structure, world, metric=metric),
+        description=_description(found, names, geometry.box.size, geometry.structure, world, metric=metric),
         center=geometry.box.center,
         aabb=geometry.aabb,
         box=geometry.box,
@@ -73,9 +74,15 @@ def record_of(
 
 
 def _description(
-    found: DerivedInstance | _Look, size: Array, structure: str | None, world: World, *, metric: bool
+    found: DerivedInstance | _Look,
+    names: Sequence[str],
+    size: Array,
+    structure: str | None,
+    world: World,
+    *,
+    metric: bool,
 ) -> str:
-    color = color_words(found.swatches, world.light)
+    color = color_words(found.swatches, names)
     words = describe(found.shape, color, size, world.unit, metric=metric, structure=structure)
     return words if found.resting else f"moving {words}"
 
@@ -100,8 +107,9 @@ def in_light(instance: Instance, looks: Looks, world: World, *, metric: bool) ->
     rows = looks.swatches.tolist()
     swatches = tuple(Swatch((int(r), int(g), int(b)), (x, y, z), share) for r, g, b, x, y, z, share in rows)
     look = _Look(looks.shape, looks.resting, swatches)
-    name, rgb = main_color(swatches, world.light)
-    words = _description(look, instance.box.size, instance.structure, world, metric=metric)
+    names = color_names(swatches, world.light)
+    name, rgb = main_color(swatches, names)
+    words = _description(look, names, instance.box.size, instance.structure, world, metric=metric)
     if (words, name) == (instance.description, instance.color_name):
         return None
     return replace(instance, description=words, color_name=name, color_rgb=rgb)

@@ -6,7 +6,7 @@ of an instance nor a small error of alignment looks like free space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,6 +148,22 @@ def point_visibility(points: Array, view: DepthView, s: VisibilitySettings) -> N
     known = (around > 0).sum(axis=0) >= 6
     free = known & (np.where(around > 0, around, np.inf) > z + slack).all(axis=0)
     out[near[inside]] = np.where(met, MET, np.where(free, FREE, UNTOLD))
+    return out
+
+
+def in_sight_of(views: Sequence[DepthView], s: VisibilitySettings) -> Array:
+    """Return the boxes round all that views can tell about, world coordinates: beyond, every point is untold.
+
+    Shape (V, 2, 3).
+    """
+    out = np.empty((len(views), 2, 3))
+    for n, view in enumerate(views):
+        fx, fy, cx, cy = view.camera
+        height, width = view.depth.shape
+        rays = np.array([((u - cx) / fx, (v - cy) / fy, 1.0) for u in (0.0, width) for v in (0.0, height)])
+        ends = np.concatenate([np.zeros((1, 3)), rays * s.most_depth_m * view.unit])
+        seen = view.S_cam_world.inverse().apply(ends)
+        out[n] = seen.min(axis=0), seen.max(axis=0)
     return out
 
 

@@ -21,6 +21,8 @@ ASK_STAMP = "SELECT * FROM words WHERE word = ''"
 
 Weights = dict[str, int]
 """Hundredths by word."""
+Texts = tuple[object, object, object, object]
+"""Label, structure, description and name of the colour of an instance."""
 
 
 class WordIndex:
@@ -28,8 +30,8 @@ class WordIndex:
 
     def __init__(self, database: sqlite3.Connection) -> None:
         self._database = database
-        self._before: dict[int, Weights] = {}
-        """Of instances that were touched: what the table holds of them."""
+        self._before: dict[int, Texts | None] = {}
+        """What instances that were touched were called when the table was last written; None for new ones."""
         database.create_function("list3r_words", 5, self._touch)
         old = ", ".join(f"OLD.{c}" for c in _TEXTS.split(", "))
         for event in ("UPDATE", "DELETE"):
@@ -46,15 +48,18 @@ class WordIndex:
 
     def _touch(self, instance: int, label: object, structure: object, description: object, color: object) -> None:
         if instance not in self._before:
-            self._before[instance] = hundredths(label, structure, description, color) if description is not None else {}
+            held = None if description is None else (label, structure, description, color)
+            self._before[instance] = held
 
     def write(self) -> None:
         """Write what has changed since the last call; inside the transaction that changed it."""
         gone: list[tuple[str, int]] = []
         come: list[tuple[str, int, int]] = []
-        for instance, before in sorted(self._before.items()):
+        for instance, held in sorted(self._before.items()):
             row = self._database.execute(f"SELECT {_TEXTS} FROM instances WHERE id = ?", (instance,)).fetchone()
-            now = {} if row is None else hundredths(*row)
+            if row == held:
+                continue
+            before, now = ({} if texts is None else hundredths(*texts) for texts in (held, row))
             gone += [(word, instance) for word in before if word not in now]
             come += [(word, instance, weight) for word, weight in now.items() if before.get(word) != weight]
         self._database.executemany("DELETE FROM words WHERE word = ? AND instance = ?", gone)
