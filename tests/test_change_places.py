@@ -114,7 +114,7 @@ def test_what_is_far_off_is_not_asked_about_and_what_is_told_is_the_same(
         return asked[-1]
 
     monkeypatch.setattr(Places, "out_of_sight", noted)
-    told = []
+    events, states = [], []
     for name, always in (("short", False), ("long", True)):
         if always:
             monkeypatch.setattr(Places, "out_of_sight", lambda *_: False)
@@ -125,10 +125,11 @@ def test_what_is_far_off_is_not_asked_about_and_what_is_told_is_the_same(
                     add_session(store, room, np.concatenate([cameras(target, 0.4, 0.4), cameras(target, 0.5, 0.4)]))
                     place_together(store)
                     consolidate(store)
-            told.append([(e.session_id, e.instance_id, e.kind, e.reason) for e in store.events.all()])
-            told.append([i.state for i in store.instances.all()])
-    assert told[:2] == told[2:]
-    assert {kind for _, _, kind, _ in told[0]} >= {"moved", "removed"}
+            events.append([(e.session_id, e.instance_id, e.kind, e.reason) for e in store.events.all()])
+            states.append([i.state for i in store.instances.all()])
+    assert events[0] == events[1]
+    assert states[0] == states[1]
+    assert {kind for _, _, kind, _ in events[0]} >= {"moved", "removed"}
     assert True in asked
 
 
