@@ -182,6 +182,7 @@ def test_frames_before_the_clock_begins_are_taken_and_what_was_cut_away_is_not(t
     assert [round(float(np.median(f.color[40:])) / 20) - 1 for f in phone.read(7, 9)] == [7, 8]
     trimmed = open_source(write_clip(tmp_path / "trimmed.mp4", -800, step_ms=100))
     assert trimmed.info.frame_count == len(list(trimmed.read(0, 100))) == 4
+    assert not any("cut off" in note for note in trimmed.info.notes)
 
 
 @pytest.mark.parametrize("size", [(96, 64), (202, 98)])

@@ -119,18 +119,20 @@ def _listed(path: Path, words: dict[str, str]) -> tuple[VideoTimestamps, float]:
         stream = picture_stream(container)
         if stream is None or any(sign in container.format.name for sign in _NOT_VIDEO):
             raise SourceError(_no_video(path, container))
-        numbers, hidden = array("q"), array("q")
+        numbers, hidden, trimmed = array("q"), array("q"), 0
         for packet in packets(container, stream):  # none is kept: together they are the file
             if packet.size and not packet.is_discard:
                 stated = (_NONE if stamp is None else stamp for stamp in (packet.pts, packet.dts))
                 numbers.extend((*stated, bool(packet.is_keyframe)))
-            elif packet.size and packet.pts is not None:
-                hidden.append(packet.pts)
+            elif packet.size:
+                trimmed += 1
+                hidden.extend(() if packet.pts is None else (packet.pts,))
         rows = np.frombuffer(numbers, np.int64).reshape(-1, 3)
         stamps = _stamps(path, rows, container, stream)
+        notes = (*stamps.notes, *_breaks_off(rows, trimmed, container, stream))
         earlier = stamps.clock and bool(hidden) and max(hidden) < stamps.stamps[0]
         hidden_s = float(int(stamps.stamps[0] - min(hidden)) * stamps.unit) if earlier else 0.0
-        return replace(stamps, words=words), hidden_s
+        return replace(stamps, words=words, notes=notes), hidden_s
 
 
 def open_container(path: Path, words: dict[str, str]) -> Any:
@@ -181,7 +183,7 @@ def _stamps(path: Path, rows: _Rows, container: Any, stream: Any) -> VideoTimest
     rate = float(stream.average_rate or stream.base_rate or 0) or DEFAULT_FPS
     aspect = Fraction(getattr(stream, "sample_aspect_ratio", None) or 1)
     focal = _positive(container.metadata.get(_FOCAL_KEY) or stream.metadata.get(_FOCAL_KEY))
-    notes = (*_other_streams(container), *_breaks_off(rows, container, stream, unit))
+    notes = _other_streams(container)
     rows, joined = _joined(rows)
     reorders = bool(stream.codec_context.has_b_frames)
     for decoding in (False, True):
@@ -226,13 +228,13 @@ def _other_streams(container: Any) -> tuple[str, ...]:
     )
 
 
-def _breaks_off(rows: _Rows, container: Any, stream: Any, unit: Fraction) -> tuple[str, ...]:
-    """Return what is said of a file that is shorter than it states."""
-    if stream.frames and len(rows) < stream.frames:
+def _breaks_off(rows: _Rows, trimmed: int, container: Any, stream: Any) -> tuple[str, ...]:
+    """Return what is said of a file that is shorter than it states; `trimmed` of its frames are there but not shown."""
+    if stream.frames and len(rows) + trimmed < stream.frames:
         return (f"the file is cut off: {len(rows)} of its {stream.frames} frames are there",)
     stated = float(container.duration or 0) / float(av.time_base)
     shown = rows[rows[:, 0] != _NONE, 0]
-    there = float(int(shown.max() - shown.min()) * unit) if len(shown) else stated
+    there = float(int(shown.max() - shown.min()) * (stream.time_base or 1)) if len(shown) else stated
     if there < stated * (1 - _MISSING_SHARE) - 1.0:
         return (f"the file is cut off: {there:.1f} of its {stated:.1f} seconds are there",)
     return ()
