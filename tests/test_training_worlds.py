@@ -204,3 +204,21 @@ def test_a_labelled_scan_of_others_is_filmed_with_its_truth(tmp_path: Path) -> N
 def _sides(along: np.ndarray, across: float) -> list[np.ndarray]:
     fixed = np.full(len(along), across)
     return [np.column_stack([along, fixed]), np.column_stack([fixed, along])]
+
+
+def test_swept_depth_lies_on_what_was_filmed_and_is_no_copy_of_it() -> None:
+    pytest.importorskip("torch")
+    from training.samples import sample_of
+    from training.swept import swept
+
+    film = make_film(FilmSettings(7003, frames=12, every=1, sensor="computed"))
+    found = swept(film, 7003)
+    assert found is not None
+    assert found.depth_noise is not None
+    known = (found.depth > 0) & (film.true_depth > 0)
+    off = np.abs(found.depth - film.true_depth)[known] / film.true_depth[known]
+    assert known.mean() > 0.2
+    assert 1e-4 < float(np.median(off)) < 0.02
+    sample = sample_of(film, 7003, 1, found)
+    assert sample.computed
+    assert any((view.depth > 0).any() for view in sample.views)

@@ -14,6 +14,7 @@ from list3r.instances.geometric.cloud import Cloud, build_cloud
 from list3r.instances.geometric.fusion import View
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.settings import InstanceSettings
+from list3r.reconstruction.base import Reconstruction
 from training.worlds.film import Film, FilmSettings, Truth, frames_of, make_film, reconstruction_of, varied
 
 
@@ -62,9 +63,11 @@ def chunk_settings(every: int = 1) -> InstanceSettings:
     return replace(usual, anchor_step=max(1, usual.anchor_step // every), view=near)
 
 
-def sample_of(film: Film, seed: int, every: int = 1) -> Sample:
-    """Return the chunk of a film, of which every n-th frame was filmed, as discovery would see it."""
-    reconstruction = reconstruction_of(film, seed=seed)
+def sample_of(film: Film, seed: int, every: int = 1, reconstruction: Reconstruction | None = None) -> Sample:
+    """Return the chunk of a film, of which every n-th frame was filmed, as discovery would see it; by what its sensor
+    read without a `reconstruction`.
+    """
+    reconstruction = reconstruction or reconstruction_of(film, seed=seed)
     views = ChunkViews(frames_of(film), reconstruction, chunk_settings(every))
     shown = tuple(views.view(p) for p in views.anchors)
     ids = tuple(film.ids[p][:: views.stride, :: views.stride].astype(np.int32) for p in views.anchors)

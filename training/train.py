@@ -95,19 +95,21 @@ def train(
     unseen = [second_lessons(p, arrays, out / "parts", FIRST_ENDS[:1], few=few)[0] for p, few in left_out]
     settings = replace(settings, epochs=max(1, epochs // 2), start=None, noise=0.15, decay=1e-2, blink=0.15)
     first = [lesson for rows in every for lesson in rows]
-    arrays |= named("coarse", fit(_second(blind), first, unseen, out / "coarse", settings))
+    arrays |= named("coarse", fit(second_network(blind), first, unseen, out / "coarse", settings))
     for k, (p, few) in enumerate(rooms):
         every[k] += second_lessons(p, arrays, out / "parts", STATES, few=few)
     unseen = [second_lessons(p, arrays, out / "parts", STATES, few=few)[-1] for p, few in left_out]
     settings = replace(settings, epochs=max(1, epochs - 2))
-    network = fit(_second(blind), [lesson for rows in every for lesson in rows], unseen, out / "states", settings)
+    network = fit(
+        second_network(blind), [lesson for rows in every for lesson in rows], unseen, out / "states", settings
+    )
     arrays |= named("coarse", network)
     arrays |= fit_things(arrays, [rows[k] for rows in every for k in (0, -2, -1)], unseen, blind=blind)
     write_weights(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, unseen)}))  # noqa: T201
 
 
-def _second(blind: Blindness) -> PieceNetwork:
+def second_network(blind: Blindness) -> PieceNetwork:
     """Return the second network, untrained."""
     nodes, edges = NODE_FEATURES + WIDTH + EXTRA_NODES, EDGE_FEATURES + EXTRA_EDGES
     depth = SECOND_DEPTH if blind.messages else 0

@@ -101,8 +101,7 @@ def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
     visit = visit or Visit()
     world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted, odd=settings.odd)
     rng = np.random.default_rng([settings.seed, 7])
-    sensors = SENSORS if settings.held_out else tuple(s for s in SENSORS if s not in HELD_OUT_SENSORS)
-    sensor = settings.sensor or str(rng.choice(sensors))
+    sensor = drawn_sensor(settings, rng)
     focal = settings.size[0] * rng.uniform(0.72, 0.9)
     w, h = settings.size
     camera = Camera(w, h, focal, focal, (w - 1) / 2, (h - 1) / 2)
@@ -124,6 +123,12 @@ def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
     things = tuple(_truth(t) for t in world.things)
     images = [np.stack(part) for part in (color, depth, true_depth, ids)]
     return Film(camera, sensor, time_s, poses, images[0], images[1], images[2], images[3], things)
+
+
+def drawn_sensor(settings: FilmSettings, rng: np.random.Generator) -> str:
+    """Return what a room is filmed with; the first thing that is drawn for a film."""
+    sensors = SENSORS if settings.held_out else tuple(s for s in SENSORS if s not in HELD_OUT_SENSORS)
+    return settings.sensor or str(rng.choice(sensors))
 
 
 def _shifted(thing: Placed, visit: Visit) -> Placed | None:

@@ -150,7 +150,7 @@ def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[i
             )
             for i, d, s in zip(instances, by, sigma, strict=True)
         ]
-        store.instances.put(there)
+        store.instances.set_places(there)
     store.library.anchors.put({n: Anchor(a.chunk_id, exact[a.chunk_id]) for n, a in others.items()})
 
 
@@ -175,7 +175,7 @@ def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None
         boxes = np.concatenate([middle - half[:, None], middle + half[:, None]], axis=1)
         there = by.apply(derived)[:, 0]
         rows = zip(instances, there, boxes, by.scale[:, None] * size, turned, _sigmas(store, some, there), strict=True)
-        store.instances.put(
+        store.instances.set_places(
             replace(i, center=c, aabb=a, box=OrientedBox(c, edges, R), position_sigma_m=s)
             for i, c, a, edges, R, s in rows
         )

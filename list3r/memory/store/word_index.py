@@ -34,9 +34,9 @@ class WordIndex:
         """What instances that were touched were called when the table was last written; None for new ones."""
         database.create_function("list3r_words", 5, self._touch)
         old = ", ".join(f"OLD.{c}" for c in _TEXTS.split(", "))
-        for event in ("UPDATE", "DELETE"):
+        for name, event in (("UPDATE", f"UPDATE OF {_TEXTS}"), ("DELETE", "DELETE")):
             database.execute(
-                f"CREATE TEMP TRIGGER words_{event} BEFORE {event} ON main.instances"
+                f"CREATE TEMP TRIGGER words_{name} BEFORE {event} ON main.instances"
                 f" BEGIN SELECT list3r_words(OLD.id, {old}); END"
             )
         database.execute(

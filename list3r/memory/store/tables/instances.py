@@ -147,6 +147,15 @@ class Instances:
         self._rows.put(records)
         self._put_boxes((i.id, i.aabb) for i in records)
 
+    def set_places(self, instances: Iterable[Instance]) -> None:
+        """Write where instances that are there lie, and how surely: all that moving them changes."""
+        records = list(instances)
+        self._connection.execute_many(
+            "UPDATE instances SET geometry = ?, position_sigma_m = ? WHERE id = ?",
+            [(*_pack_geometry(i.center, i.aabb, i.box), i.position_sigma_m, i.id) for i in records],
+        )
+        self._put_boxes((i.id, i.aabb) for i in records)
+
     def drop(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
         self._rows.delete("id = ?", (instance_id,))
