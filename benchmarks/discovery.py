@@ -3,11 +3,14 @@
 PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --json benchmarks/results/discovery.json
 PYTHONPATH=. python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
 PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --colour grey
+PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --swept
 
 Worlds come from `training/worlds` with families, textures and a sensor that training never shows; the house is one that
 others furnished (MIT-0), given by its folder. Each walk is one chunk with poses that drift by some millimetres; the
 truth is laid on it by all its cameras, as scenes are, not by the first one alone, whose own error moved everything. A
-thing counts from 150 pixels in a view; its true box is that of its visible surface. Estimates of which most pixels show
+thing counts from 150 pixels in a view; its true box is that of its visible surface. With `--swept` nothing is left of
+what a sensor read: depth is that of our own plane sweep over the pictures; walks of which it tells too little are left
+out. Estimates of which most pixels show
 a thing of fewer are neither right nor wrong.
 """
 
@@ -37,8 +40,9 @@ from list3r.instances.library import select_prompts
 from list3r.instances.settings import InstanceSettings, MaskTrackSettings
 from list3r.memory.geometry import OrientedBox, Sim3, upright_box
 from list3r.memory.relations.instance_geometry import fit_box, without_strays
-from list3r.reconstruction.base import backproject
+from list3r.reconstruction.base import Reconstruction, backproject
 from training.samples import chunk_settings
+from training.swept import swept
 from training.worlds.catalogue import LABELS
 from training.worlds.film import Film, FilmSettings, frames_of, make_film, reconstruction_of
 
@@ -56,6 +60,7 @@ def main() -> None:
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
     parser.add_argument("--house", type=Path, help="folder of a Gazebo world, or a labelled scan (PCD); walks there")
     parser.add_argument("--colour", choices=("grey", "none"), help="pictures without hue, or without anything to see")
+    parser.add_argument("--swept", action="store_true", help="depth that the plane sweep computes from the pictures")
     parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
     parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it beside")
     parser.add_argument("--json", type=Path)
@@ -67,9 +72,14 @@ def main() -> None:
         film = film_of(seed, args.sensor, args.house, fitted=args.fitted)
         if args.colour:
             film = replace(film[0], color=without_colour(film[0].color, args.colour)), film[1]
+        reconstruction = swept(film[0], seed) if args.swept else reconstruction_of(film[0], seed=seed)
+        if reconstruction is None:
+            print(f"{seed}: too little depth", flush=True)
+            continue
         for method in methods:
-            said = judge(film, seed, method, weights.get(method))
-            rows.append({"method": method, "seed": seed, "sensor": film[0].sensor, **said})
+            said = judge(film, reconstruction, method, weights.get(method))
+            sensor = "swept" if args.swept else film[0].sensor
+            rows.append({"method": method, "seed": seed, "sensor": sensor, **said})
             print(json.dumps(rows[-1]), flush=True)
     table = {m: summary([r for r in rows if r["method"] == m]) for m in methods}
     print(machine())
@@ -77,6 +87,7 @@ def main() -> None:
         print(method, json.dumps(entry))
     source = "house" if args.house else "fitted worlds" if args.fitted else "worlds"
     source += f", colour: {args.colour}" if args.colour else ""
+    source += ", depth by plane sweep" if args.swept else ""
     write_json(args.json, {"source": source, "least_px": MIN_PX, "mean": table, "walks": rows})
 
 
@@ -106,11 +117,10 @@ def without_colour(color: NDArray[np.uint8], left: str) -> NDArray[np.uint8]:
     return np.stack([np.repeat(cv2.cvtColor(c, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2) for c in color])
 
 
-def judge(film: tuple[Film, int], seed: int, method: str, weights: Path | None) -> dict[str, Any]:
+def judge(film: tuple[Film, int], reconstruction: Reconstruction, method: str, weights: Path | None) -> dict[str, Any]:
     """The figures of one method on one walk."""
     shown, every = film
     settings, frames = chunk_settings(every), frames_of(shown)
-    reconstruction = reconstruction_of(shown, seed=seed)
     views = chunk_views(frames, reconstruction, settings)
     discoverer = make(method, settings, shown, weights)
     started = time.process_time()
