@@ -264,8 +264,8 @@ class _Gathered:
             self._points.setdefault(value, []).append(points.reshape(-1, 3)[sure])
 
     def large(self, least_px: int) -> set[int]:
-        """What covers so many pixels of a view."""
-        return {value for value, most in self._most.items() if most >= least_px}
+        """What covers so many pixels of a view and has a box."""
+        return {value for value in self._joined() if self._most[value] >= least_px}
 
     def boxes(self, least_px: int = 0) -> dict[int, OrientedBox]:
         """Boxes of what covers so many pixels of a view, as of true surfaces."""

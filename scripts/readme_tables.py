@@ -189,6 +189,7 @@ def discovery() -> str:
     """
     methods = {"geometric": "rules (removed since)", "learned": "learned (default)", "true": "true masks"}
     methods["before"] = "learned, with the weights before decision 0179"
+    methods["before 0186"] = "learned, with the weights before decision 0186"
     places = {
         "discovery": "10 held-out worlds",
         "discovery-fitted": "6 held-out rooms with built-in furniture",
@@ -196,6 +197,8 @@ def discovery() -> str:
         "discovery-grey": "10 held-out worlds, grey pictures",
         "discovery-no-colour": "10 held-out worlds, pictures of one shade",
         "discovery-house-grey": "the house, grey pictures",
+        "discovery-swept": "10 held-out worlds, depth by plane sweep",
+        "discovery-swept-house": "the house, depth by plane sweep",
         "discovery-ablation": "the 10 worlds, trained on only 40 rooms",
     }
     keys = {"boxes at IoU 0.25": ("", "0.25"), "at 0.5": ("", "0.5"), "masks at 0.25": ("mask_", "0.25")}
