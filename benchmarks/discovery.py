@@ -10,8 +10,7 @@ others furnished (MIT-0), given by its folder. Each walk is one chunk with poses
 truth is laid on it by all its cameras, as scenes are, not by the first one alone, whose own error moved everything. A
 thing counts from 150 pixels in a view; its true box is that of its visible surface. With `--swept` nothing is left of
 what a sensor read: depth is that of our own plane sweep over the pictures; walks of which it tells too little are left
-out. Estimates of which most pixels show
-a thing of fewer are neither right nor wrong.
+out. Estimates of which most pixels show a thing of fewer are neither right nor wrong.
 """
 
 from __future__ import annotations
@@ -81,6 +80,8 @@ def main() -> None:
             sensor = "swept" if args.swept else film[0].sensor
             rows.append({"method": method, "seed": seed, "sensor": sensor, **said})
             print(json.dumps(rows[-1]), flush=True)
+    if not rows:
+        raise SystemExit("no walk has enough depth to be judged")
     table = {m: summary([r for r in rows if r["method"] == m]) for m in methods}
     print(machine())
     for method, entry in table.items():

@@ -2,7 +2,7 @@
 
 python -m training.computed --out DIR --start list3r/instances/learned/weights-computed.npz
 
-Half of what is learned from are the rooms of `training.train` with simulated errors of computed depth, as networks of
+A third of what is learned from are the rooms of `training.train` with simulated errors of computed depth, as networks of
 geometry make them. Every step is kept in the folder and not done again.
 """
 

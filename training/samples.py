@@ -78,15 +78,19 @@ def sample_of(film: Film, seed: int, every: int = 1, reconstruction: Reconstruct
 
 def make_sample(seed: int, folder: Path, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0) -> Path:
     """Make the chunk of a seed and write it, unless it is there already; return its file."""
-    path = (
-        folder / f"{'test' if held_out else 'train'}-{'fitted-' if fitted else ''}{'odd-' if odd else ''}{seed:06d}.npz"
-    )
+    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd)
     if not path.exists():
         settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd)
         settings = settings if held_out else varied(settings)
         sample = sample_of(make_film(settings), seed, settings.every)
         write_sample(path, sample)
     return path
+
+
+def chunk_file(seed: int, folder: Path, *, held_out: bool, fitted: bool, odd: float) -> Path:
+    """Return the file of the chunk of a seed."""
+    kind = f"{'test' if held_out else 'train'}-{'fitted-' if fitted else ''}{'odd-' if odd else ''}"
+    return folder / f"{kind}{seed:06d}.npz"
 
 
 def write_sample(path: Path, sample: Sample) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from list3r.frames.base import Frame
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.mvs.stereo import PosedFrames, Sparse, dense_depth, stereo_noise
-from training.samples import sample_of, write_sample
+from training.samples import chunk_file, sample_of, write_sample
 from training.worlds.film import Film, FilmSettings, make_film, reconstruction_of, varied
 
 DRIFT_M, DRIFT_DEG = 0.003, 0.06
@@ -50,8 +50,7 @@ def make_swept(
 
     Rooms with an odd seed are filmed half as far, with twice the frames a second.
     """
-    kind = f"{'test' if held_out else 'train'}-{'fitted-' if fitted else ''}{'odd-' if odd else ''}"
-    path = folder / f"{kind}{seed:06d}.npz"
+    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd)
     if not path.exists():
         settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd, sensor="computed")
         settings = settings if held_out else varied(settings)
