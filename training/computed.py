@@ -2,8 +2,8 @@
 
 python -m training.computed --out DIR --start list3r/instances/learned/weights-computed.npz
 
-A third of what is learned from are the rooms of `training.train` with simulated errors of computed depth, as networks of
-geometry make them. Every step is kept in the folder and not done again.
+A third of the rooms are those of `training.train` with simulated errors of computed depth, as networks of geometry
+make them. Every step is kept in the folder and not done again.
 """
 
 from __future__ import annotations
