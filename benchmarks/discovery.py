@@ -33,7 +33,8 @@ from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.evaluation.scene import alignment_of
 from list3r.evaluation.trajectory import Trajectory
 from list3r.instances.base import Discoverer, Proposals
-from list3r.instances.geometric.support import thin, without_fliers
+from list3r.instances.geometric.fusion import View
+from list3r.instances.geometric.support import thin, without_fliers, without_rims
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
 from list3r.instances.library import select_prompts
 from list3r.instances.settings import InstanceSettings, MaskTrackSettings
@@ -190,7 +191,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
             mine,
             views.small_depth(proposals.position) > 0,
         )
-        told.add(points, theirs, view.confirmed)
+        told.add(points, _without_skirts(theirs, views, view), view.confirmed)
         pairs.append(np.stack([mine[view.confirmed], theirs[view.confirmed]], axis=1))
     pixels, large = np.concatenate(pairs), true.large(MIN_PX)
     wanted = list(true.boxes(MIN_PX).values())
@@ -209,6 +210,14 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
             out |= {"duplicates": errors.duplicates, "merged": errors.merged_pairs}
             out |= {"small": len(small), "small_found": sum(k in hit for k in small)}
     return out | _by_masks(pixels, large) | _as_sure_as_right(pixels, large, said, {t.id: t.label for t in film.things})
+
+
+def _without_skirts(labels: NDArray[np.int64], views: ChunkViews, view: View) -> NDArray[np.int64]:
+    """Things of a view's pixels, -1 for none, less what memories leave out of surfaces, see `collect_supports`."""
+    if views.reconstruction.depth_noise is None:
+        return labels
+    image = (labels + 1).astype(np.int32)
+    return without_rims(image, view.depth, int(image.max())).astype(np.int64) - 1
 
 
 def _laid_by_cameras(film: Film, views: ChunkViews) -> Sim3:
