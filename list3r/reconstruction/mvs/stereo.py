@@ -26,7 +26,6 @@ from list3r.reconstruction.mvs.fusion import (
     carry,
     enlarge,
     fill_flat,
-    rims_out,
     speckles_out,
 )
 from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, make_pictures, sharpness
@@ -303,9 +302,8 @@ def _keyframe_maps(chunk: _Chunk) -> dict[int, DepthMap]:
             continue
         key, others = chunk.keyframes[row], [chunk.keyframes[k] for k in near]
         warps = _warps(chunk, key, others, chunk.fine.camera)
-        fusion = chunk.settings.fusion
-        fused = agree_and_fuse(own, [seen[k] for k in near], warps, fusion)
-        out[row] = rims_out(speckles_out(fused, fusion), fusion.rim_px, fusion.rim_step)
+        fused = agree_and_fuse(own, [seen[k] for k in near], warps, chunk.settings.fusion)
+        out[row] = speckles_out(fused, chunk.settings.fusion)
     return out
 
 
