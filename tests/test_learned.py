@@ -21,6 +21,7 @@ from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CloudCut, spread_labels
 from list3r.instances.learned.discovery import LearnedDiscoverer, _walls_apart
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGraph, Surroundings, chunk_surface
+from list3r.instances.learned.kernels import seen_across
 from list3r.instances.learned.network import Classification, classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
@@ -44,6 +45,16 @@ def random_graph(seed: int, pieces: int = 30, borders: int = 90) -> PieceGraph:
     edges = rng.normal(size=(len(left), EDGE_FEATURES)).astype(np.float32)
     moments = np.abs(rng.normal(1.0, 0.2, size=(pieces, 10))).astype(np.float32)
     return PieceGraph(nodes, left, right, edges, rng.uniform(1, 9, len(left)).astype(np.float32), moments)
+
+
+def test_a_view_tells_of_two_pieces_over_the_gap_that_computed_depth_has_at_outlines() -> None:
+    image = np.array([[0, 0, 0, -1, -1, 1, 1, 1]], np.int32)
+    depth = np.where(image > 0, 1.0, 2.0).astype(np.float32)
+    colour = np.repeat(depth[..., None], 3, axis=2)
+    for most, times in ((1, 1), (2, 3)):
+        sums = np.zeros((1, 5))
+        seen_across(image, (depth, np.full_like(depth, 0.1), colour), (0, 3, most), np.array([1]), 2, sums)
+        assert sums[0].tolist() == pytest.approx([times, 0, times, times, times * np.sqrt(2.0)])
 
 
 def one_by_one(count: int, graph: PieceGraph, score: np.ndarray, threshold: float) -> np.ndarray:

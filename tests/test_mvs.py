@@ -14,7 +14,7 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
 from list3r.reconstruction.mvs import sweep
 from list3r.reconstruction.mvs.fill import fill_regions
-from list3r.reconstruction.mvs.fusion import DepthMap, carry, fill_flat
+from list3r.reconstruction.mvs.fusion import DepthMap, carry, fill_flat, rims_out
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up
 from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
@@ -262,6 +262,22 @@ def test_holes_in_a_plane_are_filled_and_said_to_be_unsure() -> None:
     assert np.allclose(out.inverse.numpy()[hole], plane[hole], rtol=1e-3)
     assert (out.sigma.numpy()[hole] == np.float32(DepthFusionSettings().fill_sigma)).all()
     assert not out.inverse.numpy()[:, 70:].any()
+
+
+def test_what_stands_in_front_loses_its_rim_and_a_slanted_floor_nothing() -> None:
+    inverse = np.full((40, 60), 0.5, np.float32)
+    inverse[10:30, 20:40] = 1.0
+    inverse[:, 50:] = 0.0
+    shown = torch.from_numpy(inverse)
+    kept = rims_out(DepthMap(shown, 0.01 * shown), 2, 0.04)
+    gone = (kept.inverse.numpy() == 0) & (inverse > 0)
+    inner = np.zeros_like(gone)
+    inner[12:28, 22:38] = True
+    assert np.array_equal(gone, (inverse == 1.0) & ~inner), "two pixels all around what is near, and nothing else"
+    assert np.array_equal(kept.sigma.numpy() == 0, kept.inverse.numpy() == 0)
+
+    floor = torch.from_numpy(np.linspace(0.3, 1.0, 60, dtype=np.float32)[:, None].repeat(60, 1))
+    assert rims_out(DepthMap(floor, 0.01 * floor), 2, 0.04).inverse.equal(floor), "steps of 2 px of up to 0.08"
 
 
 def test_a_blank_region_takes_the_plane_of_its_rim_only_where_the_rim_is_one() -> None:

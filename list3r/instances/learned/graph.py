@@ -20,6 +20,8 @@ NODE_FEATURES = 26
 EDGE_FEATURES = 24
 REACH_PX = 3
 """Pixels between the two sides of a border that are looked at in a view; depth is least sure right at it."""
+COMPUTED_REACHES = 2
+"""How many times so far it is looked for the other side of computed depth, which has gaps at outlines."""
 
 
 @dataclass(frozen=True)
@@ -295,9 +297,10 @@ def _seen(
 ) -> NDArray[np.float64]:
     """What views show across each border: how often it is seen, who is before whom, the step of colour. (E, 5)."""
     table, sums = np.append(labels, np.int32(-1)), np.zeros((len(codes), 5))
+    most = COMPUTED_REACHES if surface.around.computed else 1
     for view, lab, index in zip(surface.views, surface.view_lab, surface.cloud.index, strict=True):
         image, limit = table[index], 6.0 * view.reading + 0.015 * view.depth
-        for apart in ((REACH_PX, 0), (0, REACH_PX)):
+        for apart in ((REACH_PX, 0, most), (0, REACH_PX, most)):
             seen_across(image, (view.depth, limit, lab), apart, codes, count, sums)
     mean = sums / np.maximum(sums[:, :1], 1.0)
     return np.column_stack([np.log1p(sums[:, 0]), mean[:, 1:3], mean[:, 3:] / 15])

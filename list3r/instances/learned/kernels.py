@@ -107,34 +107,48 @@ def contact_sums(
 def seen_across(
     image: Ints,
     view: tuple[Float, Float, Float],
-    apart: tuple[int, int],
+    apart: tuple[int, int, int],
     codes: Codes,
     count: int,
     sums: NDArray[np.float64],
 ) -> None:
-    """Add to `sums` (E, 5) what a view shows across each border, between pixels that are `apart` in rows and columns.
+    """Add to `sums` (E, 5) what a view shows across each border, between pixels that are `apart` in rows and columns;
+    where the second is of none, up to so many times (the third number) as far.
 
     How often it is seen, who is before whom, and the steps of lightness and of colour. `view` is depth and the least
     jump of it (h, w), and colours (h, w, 3); `codes` (E,) ascend.
     """
     depth, limit, lab = view
-    down, across = apart
-    for row in range(image.shape[0] - down):
-        for column in range(image.shape[1] - across):
-            a, b = image[row, column], image[row + down, column + across]
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            y, x = _across(image, row, column, apart)
+            a, b = image[row, column], image[y, x]
             if a == b or a < 0 or b < 0:
                 continue
             at = _place(codes, np.int64(min(a, b)) * count + max(a, b))
             if at < 0:
                 continue
-            jump = depth[row + down, column + across] - depth[row, column]
+            jump = depth[y, x] - depth[row, column]
             jump = -jump if a > b else jump
-            sure, first, second = limit[row, column], lab[row, column], lab[row + down, column + across]
+            sure, first, second = limit[row, column], lab[row, column], lab[y, x]
             sums[at, 0] += 1
             sums[at, 1] += jump > sure
             sums[at, 2] += jump < -sure
             sums[at, 3] += abs(second[0] - first[0])
             sums[at, 4] += np.hypot(abs(second[1] - first[1]), abs(second[2] - first[2]))
+
+
+@compiled
+def _across(image: Ints, row: int, column: int, apart: tuple[int, int, int]) -> tuple[int, int]:
+    """The pixel `apart` from another one, see `seen_across`; that one itself where all are of none or outside."""
+    y, x = row, column
+    for _ in range(apart[2]):
+        y, x = y + apart[0], x + apart[1]
+        if y >= image.shape[0] or x >= image.shape[1]:
+            break
+        if image[y, x] >= 0:
+            return y, x
+    return row, column
 
 
 @compiled

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up, stacked
+from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, greatest_around, look_up, stacked
 from list3r.reconstruction.mvs.kernels import enlarged, fill_holes, splat
 from list3r.reconstruction.mvs.settings import DepthFusionSettings
+
+_NEAREST = 1e9
+"""Stands for the inverse depth of unknown pixels where the least is looked for."""
 
 
 @dataclass(frozen=True)
@@ -147,3 +150,17 @@ def speckles_out(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
     alone = box_sum(known, radius) < settings.speckle_share * (2 * radius + 1) ** 2
     zero = torch.zeros((), device=known.device)
     return DepthMap(torch.where(alone, zero, depth.inverse), torch.where(alone, zero, depth.sigma))
+
+
+def rims_out(depth: DepthMap, reach: int, step: float) -> DepthMap:
+    """Depth without the outer pixels of what stands before something farther: within `reach` px of a `step` of depth.
+
+    Windows at an outline hold both surfaces, so that what stands in front comes out wider than it is
+    (docs/decisions/0187-rims-of-computed-depth.md). `step` is a share of depth, beyond what a plane changes there.
+    """
+    inverse, known = depth.inverse, depth.inverse > 0
+    none = torch.full((), _NEAREST, device=inverse.device)
+    least, greatest = -greatest_around(-torch.where(known, inverse, none), reach), greatest_around(inverse, reach)
+    rim = known & (2.0 * inverse - least - greatest > step * inverse)
+    zero = torch.zeros((), device=inverse.device)
+    return DepthMap(torch.where(rim, zero, inverse), torch.where(rim, zero, depth.sigma))

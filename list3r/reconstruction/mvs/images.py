@@ -107,6 +107,14 @@ def box_sum(values: Tensor, radius: int) -> Tensor:
     return _run_sum(rows, 2 * radius + 1, -2).reshape(shape)
 
 
+def greatest_around(values: Tensor, reach: int) -> Tensor:
+    """Return the greatest of values (h, w) in a square window. Shape (h, w)."""
+    size = 2 * reach + 1
+    if values.device.type == "cpu":
+        return torch.from_numpy(cv2.dilate(values.numpy(), np.ones((size, size), np.uint8)))
+    return torch.nn.functional.max_pool2d(values[None, None], size, 1, reach)[0, 0]
+
+
 def _run_sum(values: Tensor, length: int, dim: int) -> Tensor:
     count = values.shape[dim] - length + 1
     out = values.narrow(dim, 0, count).clone()

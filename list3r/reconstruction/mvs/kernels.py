@@ -12,6 +12,8 @@ Floats = NDArray[np.float32]
 _ZERO, _HALF, _ONE, _BEHIND = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(1e-4)
 _LEAST = np.float32(0.05)
 """Share of a pixel that counts."""
+_HIDING = np.float32(0.2)
+"""Share of a pixel from which a point hides what lies behind it."""
 
 
 @compiled
@@ -283,13 +285,13 @@ def splat(inverse: Floats, sigma: Floats, rotated: Floats, shift: Floats, tolera
 
 @compiled
 def _keep_nearest(places: Floats, nearest: Floats) -> None:
-    """Write the greatest inverse depth of the points around each pixel."""
+    """Write the greatest inverse depth of the points that lie on each pixel."""
     height, width = nearest.shape
     for k in range(places.shape[1]):
         column, row, right, down = _corner(places[0, k], places[1, k])
         for n in range(4):
             u, v, share = column + n % 2, row + n // 2, _share(right, down, n)
-            if share > _LEAST and 0 <= u < width and 0 <= v < height and places[2, k] > nearest[v, u]:
+            if share > _HIDING and 0 <= u < width and 0 <= v < height and places[2, k] > nearest[v, u]:
                 nearest[v, u] = places[2, k]
 
 

@@ -90,6 +90,12 @@ class DepthFusionSettings:
     """Depths of a pixel that are averaged lie no farther behind the nearest than this share of it."""
     enlarged_step: float = 0.04
     """Depths that lie on two surfaces when a picture is enlarged, share of depth."""
+    rim_px: int = 2
+    """Outer pixels of what stands before something farther that are left out of a keyframe,"""
+    carried_rim_px: int = 1
+    """and of a frame that depth was carried into: the nearest surface wins there and grows by as much."""
+    rim_step: float = 0.04
+    """Step of depth, share of it, from which something stands before something."""
     speckle_radius_px: int = 2
     """Half the window in which a pixel needs neighbours,"""
     speckle_share: float = 0.35

@@ -26,6 +26,7 @@ from list3r.reconstruction.mvs.fusion import (
     carry,
     enlarge,
     fill_flat,
+    rims_out,
     speckles_out,
 )
 from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, make_pictures, sharpness
@@ -302,8 +303,9 @@ def _keyframe_maps(chunk: _Chunk) -> dict[int, DepthMap]:
             continue
         key, others = chunk.keyframes[row], [chunk.keyframes[k] for k in near]
         warps = _warps(chunk, key, others, chunk.fine.camera)
-        fused = agree_and_fuse(own, [seen[k] for k in near], warps, chunk.settings.fusion)
-        out[row] = speckles_out(fused, chunk.settings.fusion)
+        fusion = chunk.settings.fusion
+        fused = agree_and_fuse(own, [seen[k] for k in near], warps, fusion)
+        out[row] = rims_out(speckles_out(fused, fusion), fusion.rim_px, fusion.rim_step)
     return out
 
 
@@ -332,7 +334,8 @@ def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> Depth
     T = chunk.T_chunk_cam
     warps = [Warp.between(T[chunk.keyframes[r]], T[position], chunk.fine.camera, chunk.device) for r in rows]
     carried = carry([maps[r] for r in rows], warps, chunk.settings.fusion)
-    return fill_flat(carried, chunk.settings.fusion)
+    fusion = chunk.settings.fusion
+    return rims_out(fill_flat(carried, fusion), fusion.carried_rim_px, fusion.rim_step)
 
 
 def _full_size(

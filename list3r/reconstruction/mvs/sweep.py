@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 
-from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, look_up, stacked
+from list3r.reconstruction.mvs.images import Tensor, Warp, box_sum, greatest_around, look_up, stacked
 from list3r.reconstruction.mvs.kernels import lowest, path_costs, zncc_cost
 from list3r.reconstruction.mvs.settings import SweepSettings
 
@@ -197,7 +196,7 @@ def choose_at_edges(
     The smallest windows decide, and the evidence of neighbours counts as far as they look alike (adaptive support
     weights, Yoon and Kweon 2006): coarse windows make what stands in front wider than it is.
     """
-    front, back = _greatest_around(start, settings.edge_reach_px), -_greatest_around(-start, settings.edge_reach_px)
+    front, back = greatest_around(start, settings.edge_reach_px), -greatest_around(-start, settings.edge_reach_px)
     small = replace(settings, radius_px=1)
     depths = torch.stack([start, front, back])
     cost = matching_cost(SweepReference.of(gray, 1, settings.image_noise), sources, warps, depths, small)
@@ -207,14 +206,6 @@ def choose_at_edges(
     edge = front - back > 2.0 * spacing
     doubt = edge & (apart.amin(dim=0) - cost.amin(dim=0) < settings.edge_doubt)
     return torch.where(edge, chosen, start), doubt
-
-
-def _greatest_around(values: Tensor, reach: int) -> Tensor:
-    """Greatest of values (h, w) in a square window. Shape (h, w)."""
-    size = 2 * reach + 1
-    if values.device.type == "cpu":
-        return torch.from_numpy(cv2.dilate(values.numpy(), np.ones((size, size), np.uint8)))
-    return torch.nn.functional.max_pool2d(values[None, None], size, 1, reach)[0, 0]
 
 
 def _alike_mean(values: Tensor, gray: Tensor, settings: SweepSettings, radius: int = 6, step: int = 2) -> Tensor:
