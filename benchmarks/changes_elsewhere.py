@@ -185,7 +185,7 @@ def one_home(root: Path, method: str) -> dict[str, Any]:
     report, usage = run_list3r("update", str(two), str(root / "second"), *common)
     out = {"placed": report["placed"], "chunks": report["chunks"], **usage}
     with Store.open(one) as before, Store.open(two) as after:
-        return out | measure(before, after, root)
+        return out | measure(before, after, [root / name for name in ("first", "second")])
 
 
 if __name__ == "__main__":

@@ -95,24 +95,26 @@ def one_home(root: Path, seed: int, workers: str, discovery: str = "") -> dict[s
     shutil.copy(one, two)
     report, usage = run_list3r("update", str(two), str(root / "second"), *common)
     with Store.open(one) as before, Store.open(two) as after:
-        figures = measure(before, after, root)
+        figures = measure(before, after, [root / "first", root / "second"])
     return {"placed": report["placed"], "chunks": report["chunks"], "ties": report["ties"], **usage, **figures}
 
 
-def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
-    """Placement, ids and events of an updated memory against the truth."""
-    truth = [read_tum(root / name / "groundtruth.txt") for name in ("first", "second")]
-    scenes = [read_scene(root / name / "truth.json") for name in ("first", "second")]
+def measure(before: Store, after: Store, walks: Sequence[Path]) -> dict[str, Any]:
+    """Placement, ids and events of an updated memory against the truth of the walks in it, before and with the last."""
+    last = len(walks)
+    truth = [read_tum(walk / "groundtruth.txt") for walk in (walks[0], walks[-1])]
+    scenes = [read_scene(walk / "truth.json") for walk in walks[-2:]]
     S_truth_one = alignment_of(truth[0], _path(before, 1), with_scale=False)
     S_truth_two = alignment_of(truth[0], _path(after, 1), with_scale=False)
-    moved_m, turned_deg = _placement(truth[1], _path(after, 2), S_truth_two)
+    moved_m, turned_deg = _placement(truth[1], _path(after, last), S_truth_two)
     first = evaluate_scene(_scene(before), scenes[0], S_truth_one)
     was = {e: t for t, e, _ in first["matched_ids"]}
-    now = {e: t for t, e, _ in evaluate_scene(_scene(after), scenes[1], S_truth_two)["matched_ids"]}
+    second = evaluate_scene(_scene(after), scenes[1], S_truth_two)
+    now = {e: t for t, e, _ in second["matched_ids"]}
     done = _changes(scenes)
     unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
     kept = sum(now.get(after.ids.resolve(i)) == t for i, t in unchanged)
-    told = {_told(e, was, now, scenes, S_truth_two) for e in after.events.all(2) if e.kind in KINDS}
+    told = {_told(e, was, now, scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
     faint = _changes(scenes, 0) - done
     told -= faint | {(kind, t) for k, t in faint if k == "moved" for kind in ("removed", "added")}
     wrong = sorted((k, t) for k, t in told - done)
@@ -126,12 +128,13 @@ def measure(before: Store, after: Store, root: Path) -> dict[str, Any]:
         "missed": sorted((k, t, t in known) for k, t in done - told),
         "false": wrong,
         "false_removed_unseen": sum(k == "removed" and _unseen(scenes[1], t) for k, t in wrong),
-        "first": of_first(first),
+        "first": things_found(first),
+        "last": things_found(second),
     }
 
 
-def of_first(found: dict[str, Any]) -> dict[str, Any]:
-    """Things and relations of the first session alone: counts."""
+def things_found(found: dict[str, Any]) -> dict[str, Any]:
+    """Things and relations after a session: counts."""
     names = ("true_count", "estimated_count", "matched", "duplicates", "merged_pairs")
     out: dict[str, Any] = {k: {n: found[f"instances_{k}"][n] for n in names} for k in ("0.25", "0.50")}
     for name, entry in found["relations"]["by_predicate"].items():

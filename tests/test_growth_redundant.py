@@ -91,7 +91,8 @@ def test_redundant_chunks_follow_edits_and_moves(walks: ModuleType, tmp_path: Pa
             store.chunks.place({6: Sim3.exp(np.array([0.0, 40.0, 0.0, 0, 0, 0, 0]))}, {6: 1})
             consolidate(store, settings=CULL)
         assert store.library.redundant.chunks() == set()
-        assert len({o.instance_id for o in store.observations.all() if o.chunk_id == 6}) >= 12
+        owners = {k: {o.instance_id for o in store.observations.all() if o.chunk_id == k} for k in (1, 6)}
+        assert len(owners[6]) >= 12 and owners[6] & owners[1] == {things[0], things[2]}
         assert store.verify() == []
 
 

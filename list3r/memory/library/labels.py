@@ -203,8 +203,11 @@ def apply_labels(
 
 
 def _members(store: Store, instance_id: int) -> list[Key]:
-    """Return the local instances that an instance was derived of; others are like one of these."""
+    """Return the local instances that an instance is derived of, or was before later sessions saw it again; others are
+    like one of these.
+    """
     group = store.library.members.group_of(instance_id)
+    group += [row.key for row in store.library.redundant.superseded(group)]
     return group or [(o.chunk_id, o.local_id) for o in store.observations.of(instance_id)]
 
 

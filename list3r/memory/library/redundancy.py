@@ -1,4 +1,4 @@
-"""Local instances that add nothing to what others of their session saw.
+"""Local instances that add nothing to what others of their session, or later sessions, saw.
 
 A camera that stays in one room comes to the same things again and again. As ORB-SLAM (IEEE T-RO 2015) culls keyframes
 whose points enough other keyframes see, a local instance is redundant whose surface enough earlier chunks of its
@@ -6,24 +6,30 @@ session saw, as one thing or in pieces: no group is formed, weighed or derived w
 new in it, not how often its place was seen (decisions 0113 and 0118). A redundant one counts among the observations of
 the instance that it is like.
 
-It is decided when a chunk settles, of what was settled before it; what was not redundant once stays so.
+It is decided when a chunk settles, of what was settled before it; what was not redundant once stays so until enough
+later sessions saw the instance again, and its surface: that is decided when a session ends. What changed is told of all
+that sessions saw, those included (decision 0189).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.change.ledger import ChangeLedger, Group, read_ledger
 from list3r.memory.library.region import Region
 from list3r.memory.merging.edges import NONE, links_of
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.overlap.pair_scores import Key, pair_scores
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints, lies_on
 from list3r.memory.records import Instance, Observation
-from list3r.memory.runs import runs_seen, seen_together
+from list3r.memory.runs import SeenRuns, runs_seen, seen_together
+from list3r.memory.store.derived import LruCache
+from list3r.memory.store.store import Store
 from list3r.memory.store.tables.library import RedundantInstance
 
 _COMPARED = 3
@@ -64,12 +70,17 @@ def cull(region: Region, moved: Collection[int], edited: Iterable[Key]) -> Culle
         before = [row for row in known.values() if row.key[0] == k]
         if not before and region.store.library.members.of([k]):
             continue
-        found = _redundant(region, k) if k in moved else before
+        found = before
+        if k in moved:
+            found = _still_superseded(region, k, before)
+            known_so = {row.key for row in found}
+            found += [row for row in _redundant(region, k) if row.key not in known_so]
         found = [row for row in found if not before or row.key in known]
         found = [row for row in found if not links.forbids(row.key, row.like)]
         if found or before:
             every = len(found) == len(region.summaries[k].shapes.local_id)
             table.put(k, found, all_of_it=every)
+            region.store.observations.forget({row.key for row in before} - {row.key for row in found})
             region.look_again(k)
             like.update(row.like for row in (*before, *found) if row.like != row.key)
     return Culled(frozenset(asked & region.rows.keys()), frozenset(like))
@@ -83,7 +94,7 @@ def _redundant(region: Region, k: int) -> list[RedundantInstance]:
     if settings.chunks == 0 or len(earlier) < settings.chunks:
         return []
     shapes = summary.shapes
-    known, beside = _seen_before(region, k, earlier)
+    known, beside = _seen_by(region, k, [(u,) for u in earlier], settings.chunks)
     known &= ~np.isin(shapes.local_id, list(summary.motions))
     if not len(shapes.points) or not known[shapes.owner].any():
         return []
@@ -95,27 +106,32 @@ def _redundant(region: Region, k: int) -> list[RedundantInstance]:
     ]
 
 
-def _seen_before(region: Region, k: int, earlier: Sequence[int]) -> tuple[NDArray[np.bool_], list[int]]:
-    """Return of which local instances of a chunk enough of some earlier chunks saw the surface, and the chunks that saw
-    most of the surface of one of them.
+def _seen_by(
+    region: Region, k: int, others: Sequence[Collection[int]], enough: int
+) -> tuple[NDArray[np.bool_], list[int]]:
+    """Return of which local instances of a chunk `enough` of some sets of chunks saw the surface, and the chunks that
+    saw most of the surface of one of them.
     """
     settings, shapes = region.settings.redundancy, region.summaries[k].shapes
     points = region.settled[k].S_graph_chunk.apply(shapes.points)
     total = np.bincount(shapes.owner, minlength=len(shapes.local_id))
     times, known, grown = np.zeros(len(points), np.int64), total == 0, region.store.derived.of(GrownCells)
     met: dict[int, Ints] = {}
-    for u in earlier:
-        row = region.rows[u]
-        asked = ~known[shapes.owner] & (times < settings.chunks)
-        asked &= ((points >= row.extent[0]) & (points <= row.extent[1])).all(axis=1)
-        at = np.flatnonzero(asked)
-        if not len(at):
-            continue
-        placed = row.S_graph_chunk.inverse().apply(points[at])
-        seen = at[lies_on(placed, region.still(u), grown)]
+    for chunks in others:
+        seen = np.zeros(len(points), bool)
+        for u in chunks:
+            row = region.rows[u]
+            asked = ~known[shapes.owner] & (times < enough) & ~seen
+            asked &= ((points >= row.extent[0]) & (points <= row.extent[1])).all(axis=1)
+            at = np.flatnonzero(asked)
+            if not len(at):
+                continue
+            placed = row.S_graph_chunk.inverse().apply(points[at])
+            found = at[lies_on(placed, region.still(u), grown)]
+            seen[found] = True
+            met[u] = np.bincount(shapes.owner[found], minlength=len(total))
         times[seen] += 1
-        met[u] = np.bincount(shapes.owner[seen], minlength=len(total))
-        often = np.bincount(shapes.owner, times >= settings.chunks, minlength=len(total))
+        often = np.bincount(shapes.owner, times >= enough, minlength=len(total))
         known = often >= settings.covered * total
         if known.all():
             break
@@ -141,17 +157,73 @@ def _like(region: Region, k: int, shapes: ChunkShapes, beside: Sequence[int]) ->
     return {local_id: key for local_id, (_, key) in best.items()}
 
 
+def _still_superseded(region: Region, k: int, rows: Sequence[RedundantInstance]) -> list[RedundantInstance]:
+    """Return those rows of a chunk whose local instances are where they lie now like those that they rest on."""
+    later = {row.key[1]: row for row in rows if _session(region, row.like) > _session(region, row.key)}
+    shapes = region.summaries[k].shapes
+    there = sorted({row.like[0] for row in later.values() if region.takes_part(row.like)}.intersection(region.near(k)))
+    like = _like(region, k, shapes.only(np.isin(shapes.local_id, list(later))), there) if there else {}
+    return [replace(later[n], like=key) for n, key in like.items()]
+
+
+def superseded(region: Region, groups: Iterable[Group], spared: Collection[Key]) -> list[RedundantInstance]:
+    """Return the members of groups that need not be looked at any more: enough later sessions saw the instance again,
+    and the surface of the member; those `spared` stay.
+    """
+    settings, wanted = region.settings.redundancy, dict[int, dict[int, Group]]()
+    later: dict[Key, Group] = {}
+    for g in groups:
+        sessions = sorted({_session(region, key) for key in g})
+        if not settings.sessions or len(sessions) <= settings.sessions:
+            continue
+        kept = tuple(key for key in g if _session(region, key) >= sessions[-settings.sessions])
+        later |= dict.fromkeys(kept, kept)
+        for k, n in g:
+            if (k, n) not in later and (k, n) not in spared:
+                wanted.setdefault(k, {})[n] = kept
+    return [row for k, of in wanted.items() for row in _superseded(region, k, of)]
+
+
+def _superseded(region: Region, k: int, wanted: Mapping[int, Group]) -> list[RedundantInstance]:
+    """Return the same of one chunk; its local instances that are asked about with the later members of their groups."""
+    by_session: dict[int, list[int]] = {}
+    for u in sorted({u for kept in wanted.values() for u, _ in kept}, reverse=True):
+        by_session.setdefault(_session(region, (u, 0)), []).append(u)
+    known, beside = _seen_by(region, k, list(by_session.values()), region.settings.redundancy.sessions)
+    shapes = region.summaries[k].shapes
+    known &= np.isin(shapes.local_id, list(wanted))
+    like = _like(region, k, shapes.only(known), beside) if known.any() else {}
+    out = []
+    for n, frames in zip(shapes.local_id[known].tolist(), compress(shapes.frames, known), strict=True):
+        best = like.get(n)
+        if best not in wanted[n]:
+            best = max(wanted[n], key=lambda key: (region.seen_for(key), key))
+        out.append(RedundantInstance((k, n), best, frames.astype(np.int32)))
+    return out
+
+
+def _session(region: Region, key: Key) -> int:
+    return region.store.chunks.get(key[0]).session_id
+
+
+def followers(store: Store, keys: Iterable[Key]) -> list[RedundantInstance]:
+    """Return the redundant local instances that belong where some local instances do, each after what it is like."""
+    old = store.library.redundant.superseded(keys)
+    return [*old, *store.library.redundant.like([*keys, *(row.key for row in old)])]
+
+
 def follow(region: Region, moved: Collection[int], culled: Culled, written: Collection[int]) -> set[int]:
     """Write which instances the redundant local instances of chunks that moved belong to, and when those were seen that
     were not `written` anew; return their ids.
     """
     store = region.store
     rows = store.library.redundant.of(sorted(moved))
-    owners = store.observations.owners(sorted(culled.like))
+    owners = store.observations.owners(sorted({*culled.like, *(row.like for row in rows if row.like != row.key)}))
     store.observations.forget(row.key for row in rows if row.like not in owners)
     store.observations.set(Observation(owners[row.like], *row.key) for row in rows if row.like in owners)
     ids = sorted(set(owners.values()) - set(written))
-    seen = {n: sightings(region, _members(region, n)) for n in ids}
+    ledger = read_ledger(store, store.chunks.all()) or ChangeLedger(0)
+    seen = {n: sightings(region, ledger.current(_members(region, n))) for n in ids}
     store.instances.put(s.on(i) for i in store.instances.of(ids) if (s := seen[i.id]) is not None)
     return set(ids)
 
@@ -161,15 +233,39 @@ def _members(region: Region, instance_id: int) -> list[Key]:
     return [key for key in group if region.takes_part(key)]
 
 
+class _EarlierCache(LruCache[Key, tuple[int, dict[int, SeenRuns]]]):
+    """By the local instance that they are like, with what tells when that holds."""
+
+    def __init__(self) -> None:
+        super().__init__(10_000)
+
+
+def _seen_in_earlier(region: Region, key: Key) -> dict[int, SeenRuns]:
+    """Return when those were seen, by session, that a local instance of a later one is looked at instead of."""
+    redundant, kept = region.store.library.redundant, region.store.derived.of(_EarlierCache)
+    redundant.chunks()
+    found = kept.get(key)
+    if found is None or found[0] != redundant.turned:
+        parts: dict[int, list[SeenRuns]] = {}
+        for row in redundant.superseded([key]):
+            own = [runs_seen(row.key[0], row.frames), redundant.seen_like(row.key)]
+            parts.setdefault(_session(region, row.key), []).extend(own)
+        found = kept.put(key, (redundant.turned, {session: seen_together(seen) for session, seen in parts.items()}))
+    return found[1]
+
+
 def sightings(region: Region, group: Sequence[Key]) -> SeenSpan | None:
     """Return when a group is seen, with the redundant local instances that are like it."""
-    sessions: dict[int, list[Key]] = {}
+    redundant = region.store.library.redundant
+    sessions: dict[int, list[SeenRuns]] = {}
     for key in group:
-        sessions.setdefault(region.store.chunks.get(key[0]).session_id, []).append(key)
+        parts = sessions.setdefault(_session(region, key), [])
+        parts += [runs_seen(key[0], region.frames_of(key)), redundant.seen_like(key)]
+        for session, seen in _seen_in_earlier(region, key).items():
+            sessions.setdefault(session, []).append(seen)
     count, times = 0, list[float]()
-    for session, keys in sessions.items():
-        own = [runs_seen(key[0], region.frames_of(key)) for key in keys]
-        seen = seen_together([*own, *map(region.store.library.redundant.seen_like, keys)])
+    for session, parts in sessions.items():
+        seen = seen_together(parts)
         if len(seen.runs):
             count += int(np.diff(seen.runs).sum())
             ends = (seen.first, int(seen.runs[0, 0])), (seen.last, int(seen.runs[-1, 1]) - 1)

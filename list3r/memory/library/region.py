@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.memory.change.detection import across_sessions
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
@@ -26,7 +27,7 @@ from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.library import SettledRow
+from list3r.memory.store.tables.library import RedundantInstance, SettledRow
 
 _KEPT = 3000
 """Pairs of chunks whose links are kept: a walk that stays in one room comes to the same pairs again. They take some
@@ -196,6 +197,32 @@ class Region:
         self.settled[chunk_id] = row
         self.rows = _Chunks(self.store.path, dict(sorted({**self.rows, chunk_id: row}.items())))
 
+    def supersede(self, instances: Sequence[RedundantInstance]) -> None:
+        """Leave out from now on local instances that later sessions saw again."""
+        library, gone = self.store.library, dict[int, list[int]]()
+        for row in instances:
+            gone.setdefault(row.key[0], []).append(row.key[1])
+        position, dropped, empty = dict[int, Ints](), dict[int, NDArray[np.bool_]](), set[int]()
+        for k, local_ids in gone.items():
+            shapes = self.shapes(k)
+            kept = ~np.isin(shapes.local_id, local_ids)
+            position[k] = np.where(kept, np.cumsum(kept) - 1, -1)
+            dropped[k] = library.settled.dropped(k, len(shapes.points))[kept[shapes.owner]]
+            empty |= set() if kept.any() else {k}
+        stored = library.overlaps.all(sorted(gone))
+        found = {p: self._read_scores(p, blob).renumbered(*map(position.get, p)) for p, blob in stored.items()}
+        library.overlaps.drop(p for p in stored if not empty.isdisjoint(p))
+        library.overlaps.put({p: pack_scores(x) for p, x in found.items() if empty.isdisjoint(p)})
+        library.redundant.supersede(instances, empty)
+        library.members.drop(row.key for row in instances)
+        for k in gone:
+            self.look_again(k)
+        library.settled.set_dropped({k: bits for k, bits in dropped.items() if k not in empty})
+        self._pairs.clear()
+        self._paired.clear()
+        self._scores.clear()
+        self._linked = None
+
     def components(self, keys: Iterable[Key]) -> dict[int, int]:
         """Return the connected component of each chunk that has one of these local instances."""
         return {k: self.rows[k].component for k in {k for k, _ in keys}}
@@ -333,25 +360,25 @@ class Region:
 
     def span_of(self, chunk_id: int) -> Array:
         """Return the box round the points and the cameras of a chunk, in the frame of the graph. Shape (2, 3)."""
-        extent = self.rows[chunk_id].extent
+        extent = self.settled[chunk_id].extent
         frames = [
             f.T_chunk_cam[:3, 3] for f in self.store.frames.of(self.store.chunks.get(chunk_id)) if f.state == "posed"
         ]
         if not frames:
             return extent
-        at = self.rows[chunk_id].S_graph_chunk.apply(np.array(frames))
+        at = self.settled[chunk_id].S_graph_chunk.apply(np.array(frames))
         return np.stack([np.minimum(extent[0], at.min(axis=0)), np.maximum(extent[1], at.max(axis=0))])
 
     def within_sight(self, chunk_ids: Iterable[int]) -> list[int]:
         """Return the chunks that the frames of these can tell about, and those whose frames can tell about these."""
-        ids = sorted(self.rows)
+        ids = sorted(self.settled)
         boxes = np.array([self.span_of(k) for k in ids])
-        part = np.array([self.rows[k].component for k in ids])
+        part = np.array([self.settled[k].component for k in ids])
         most_depth = self.settings.changes.visibility.most_depth_m
         depth = most_depth * self.world.unit / float(self._T_world_graph.scale)
         found = np.zeros(len(ids), bool)
         for k in chunk_ids:
             low, high = boxes[ids.index(k)]
             meet = np.all((boxes[:, 0] <= high + depth) & (boxes[:, 1] >= low - depth), axis=1)
-            found |= meet & (part == self.rows[k].component)
-        return [k for k, near in zip(ids, found, strict=True) if near]
+            found |= meet & (part == self.settled[k].component)
+        return [k for k, near in zip(ids, found, strict=True) if near and k in self.rows]

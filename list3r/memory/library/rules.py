@@ -35,10 +35,12 @@ _POSED = 80
 
 @dataclass(frozen=True)
 class RedundancySettings:
-    """When a local instance adds nothing to what other chunks of its session saw."""
+    """When a local instance adds nothing to what other chunks saw."""
 
     chunks: int = 12
-    """Earlier chunks that must have seen its surface, as one thing or in pieces; 0: none is redundant."""
+    """Earlier chunks of its session that must have seen its surface, as one thing or in pieces; 0: none is so."""
+    sessions: int = 3
+    """Later sessions that must have seen it again, and its surface so; 0: none is so."""
     covered: float = 0.75
     """Share of its surface that so many must have seen."""
 

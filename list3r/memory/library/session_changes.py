@@ -9,9 +9,13 @@ from list3r.memory.change.ledger import ChangeLedger, Group
 from list3r.memory.change.records import Changes
 from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping, chunks_of
+from list3r.memory.library.redundancy import superseded
+from list3r.memory.library.rules import edited_since
 from list3r.memory.library.weighing import Weighing
+from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.summaries import SomeSummaries
 from list3r.memory.records import MergeDecision
+from list3r.memory.store.tables.library import RedundantInstance
 
 
 class SessionChanges:
@@ -37,7 +41,7 @@ class SessionChanges:
         groups and the decisions.
         """
         region = self._g.region
-        rows = {k: self._store.chunks.get(k) for k in self._rows}
+        rows = {k: self._store.chunks.get(k) for k in region.settled}
         first = min(c.session_id for c in rows.values())
         later = [k for k, c in rows.items() if c.session_id > first]
         if not later:
@@ -49,15 +53,26 @@ class SessionChanges:
         places, decisions = self._g.partition(seeds)
         self._g.adopt(places)
         weighed = self._weighing.weigh_only(places)
-        moving = frozenset(g[0] for g in places if self._g.mover(g) is not None)
-        names = chunks_of(places) | {min(k for k, c in rows.items() if c.component == region.world.first)}
-        self._found = find_changes(
+        still = {g for g in places if self._g.mover(g) is None}
+        old = self._store.library.redundant.superseded()
+        every = dict(sorted(zip(_with(places, old), places, strict=True)))
+        names = chunks_of(every) | {min(k for k, c in rows.items() if c.component == region.world.first)}
+        found = find_changes(
             self._store,
-            OverlapGroups(places, [weighed.shown[g] for g in places], moving),
+            OverlapGroups(
+                list(every),
+                [weighed.shown[g] for g in every.values()],
+                frozenset(whole[0] for whole, g in every.items() if g not in still),
+            ),
             [region.settled_chunk(k) for k in sorted(names)],
             SomeSummaries(region.summaries, names, region.world.unit),
             region.settings.changes,
         )
+        fresh = superseded(region, still, edited_since(self._store, 0))
+        region.supersede(fresh)
+        gone = {row.key for row in (*old, *fresh)}
+        self._found = found.without(gone)
+        places = [tuple(k for k in g if k not in gone) for g in places]
         self._g.ledger = ChangeLedger.of(self._found, places, self._g.ledger.session)
         groups = [tuple(g) for g in self._found.groups]
         self._compared = frozenset(groups)
@@ -88,3 +103,13 @@ class SessionChanges:
         self._store.instances.set_states(fresh)
         turned = [n for n, s in fresh.items() if "removed" in (s, now[n][0])]
         return fresh, {i.id: i.aabb for i in self._store.instances.of(sorted(turned))}
+
+
+def _with(groups: Sequence[Group], old: Sequence[RedundantInstance]) -> list[Group]:
+    """Return groups with the local instances of earlier sessions that belong to them, though nothing is grouped by
+    those any more.
+    """
+    like: dict[Key, list[Key]] = {}
+    for row in old:
+        like.setdefault(row.like, []).append(row.key)
+    return [tuple(sorted([*g, *(key for member in g for key in like.get(member, ()))])) for g in groups]

@@ -11,7 +11,7 @@ from list3r.memory.change.ledger import Group
 from list3r.memory.geometry import Array
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.instances import DerivedInstance, Members, derived_instance
-from list3r.memory.library.redundancy import sightings
+from list3r.memory.library.redundancy import followers, sightings
 from list3r.memory.library.rows import looks_of, moved, record_of
 from list3r.memory.library.session_changes import SessionChanges
 from list3r.memory.library.uncertainty import position_sigma
@@ -69,9 +69,10 @@ class Writer:
             store.instances.drop(n, dict(ids.aliases).get(n))
         now = {key: n for n, g in fresh.items() for key in g}
         turned = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
-        like = {row.key: row.like for row in store.library.redundant.like(turned)}
-        before |= store.observations.owners(list(like))
-        now |= {key: now[other] for key, other in like.items() if other in now}
+        like = followers(store, turned)
+        before |= store.observations.owners([row.key for row in like])
+        for row in like:
+            now |= {row.key: now[row.like]} if row.like in now else {}
         store.observations.forget(before.keys() - now.keys())
         store.observations.set(Observation(n, *key) for key, n in now.items() if before.get(key) != n)
         order = sorted(fresh)
@@ -98,14 +99,17 @@ class Writer:
         """Return an instance, with its confidence still to be said."""
         region = self._region
         chunks = {k: (region.shapes(k), region.pose(k), self._weighing.dropped_of(k)) for k in {k for k, _ in group}}
-        mover = self._g.mover(group)
-        here = group if mover is not None else self._g.ledger.current(group)
+        mover, here = self._g.mover(group), self._here(group)
         component = region.rows[group[0][0]].component
         upright = self._world.upright and component == self._world.first
         marks = {k: region.mark(k) for k in chunks}
         members = Members(group, here, chunks, marks, component, upright, mover)
         found = derived_instance(self._store, instance_id, members, self._s.derive)
         return replace(found, geometry=replace(found.geometry, structure=structure))
+
+    def _here(self, group: Group) -> Group:
+        """Return the members of a group that show it where it is now."""
+        return group if self._g.mover(group) is not None else self._g.ledger.current(group)
 
     def _stored(self, ids: Iterable[int]) -> list[InstanceGeometry]:
         """Return geometries of instances as they are in the store."""
@@ -157,8 +161,9 @@ class Writer:
             times = {f: t for k in chunks for f, t in self._region.times_of(k).items()}
             exact = store.chunks.get(found.anchor).S_world_chunk @ self._region.pose(found.anchor).inverse()
             record = moved(record_of(found, labels.get(n), times, self._world, metric=metric), exact)
-            if self._store.library.redundant.chunks() and (seen := sightings(self._region, groups[n])) is not None:
-                record = seen.on(record)
+            if self._store.library.redundant.any():
+                seen = sightings(self._region, self._here(groups[n]))
+                record = record if seen is None else seen.on(record)
             sigma = position_sigma(record.center, [store.chunks.get(k) for k in chunks])
             records.append(replace(record, state=self._states[n], position_sigma_m=sigma))
             anchors[n] = Anchor(found.anchor, exact)

@@ -33,6 +33,14 @@ class PairScores:
     frame_iou: Array
     """Mean IoU of their boxes in those frames. Shape (E,)."""
 
+    def renumbered(self, first: Ints | None, second: Ints | None) -> PairScores:
+        """Return those of which both have a new position in their chunk, which is -1 for the others. None: as it is."""
+        i = self.i if first is None else first[self.i]
+        j = self.j if second is None else second[self.j]
+        kept = (i >= 0) & (j >= 0)
+        rest = (getattr(self, name)[kept] for name in ("i_on_j", "j_on_i", "shared", "frame_iou"))
+        return PairScores(i[kept], j[kept], *rest)
+
 
 def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3, grown: GrownCells | None = None) -> PairScores:
     """Compare all local instances of two chunks; pairs whose surfaces nowhere meet are left out.

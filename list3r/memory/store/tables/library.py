@@ -6,7 +6,7 @@ as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -76,11 +76,12 @@ class GroupMember:
 
 @dataclass(frozen=True)
 class RedundantInstance:
-    """A local instance whose surface enough other chunks of its session saw."""
+    """A local instance whose surface enough other chunks of its session saw, or enough later sessions."""
 
     key: Key
     like: Key
-    """The local instance of another chunk that is the same instance; its own key where there is none."""
+    """The local instance of another chunk that is the same instance; its own key where there is none. If it is of a
+    later session, that saw it again."""
     frames: Annotated[NDArray[np.int32], Shape((-1,))]
     """Frame.index of the frames in which it is seen. Shape (V,)."""
 
@@ -214,6 +215,10 @@ class GroupMembers:
         """Write of local instances which group they are in; they leave those that they were in."""
         self._rows.put(members)
 
+    def drop(self, keys: Iterable[Key]) -> None:
+        """Take local instances out of their groups."""
+        self._connection.execute_many("DELETE FROM members WHERE chunk_id = ? AND local_id = ?", list(keys))
+
     def hidden_groups(self) -> int:
         """Return how many groups are not shown."""
         return self._rows.count("shown = 0 AND chunk_id = first_chunk AND local_id = first_local")
@@ -230,6 +235,8 @@ class _SeenCache(LruCache[Key, SeenRuns]):
 
 
 _LIKE = joined(("like_chunk", "like_local"), ("like",), tuple, lambda *key: (key,))
+_SESSION = "(SELECT session_id FROM chunks c WHERE c.chunk_id = redundant.{})"
+_OTHER_SESSION = f"({_SESSION.format('chunk_id')} != {_SESSION.format('like_chunk')})"
 
 
 class Redundant:
@@ -240,6 +247,7 @@ class Redundant:
         columns = Columns.of(RedundantInstance, _KEY, _LIKE)
         self._rows = Table(connection, "redundant", columns, "chunk_id, local_id")
         self._known: set[int] | None = None
+        self._superseding: set[Key] | None = None
         self._seen = _SeenCache()
         self.turned = 0
         """Grows when rows of chunks that had any are others."""
@@ -256,6 +264,10 @@ class Redundant:
             self._turn()
         return self._known
 
+    def any(self) -> bool:
+        """Return whether any local instance is redundant."""
+        return bool(self._connection.rows("SELECT EXISTS (SELECT 1 FROM redundant)")[0][0])
+
     def partly(self) -> Set[int]:
         """Return the ids of the chunks of which some local instances are redundant and others are not."""
         rows = self._connection.rows("SELECT DISTINCT chunk_id FROM redundant")
@@ -271,12 +283,25 @@ class Redundant:
         return self._rows.among("chunk_id", chunk_ids, f"NOT EXISTS ({grouped})")
 
     def like(self, keys: Iterable[Key], after: int = 0) -> list[RedundantInstance]:
-        """Return those of chunks `after` one that are the same instance as one of these local instances, in order."""
-        where = "like_chunk = ? AND like_local = ? AND chunk_id > ?"
+        """Return those of chunks `after` one that are the same instance as one of these local instances, in order, all
+        of the same session.
+        """
+        where = f"like_chunk = ? AND like_local = ? AND chunk_id > ? AND NOT {_OTHER_SESSION}"
         return [row for key in keys for row in self._rows.all(where, (*key, after))]
 
+    def superseded(self, keys: Iterable[Key] | None = None) -> list[RedundantInstance]:
+        """Return those that one of these local instances, or any, of a later session saw again."""
+        if keys is None:
+            return self._rows.all(_OTHER_SESSION)
+        self.chunks()
+        if self._superseding is None:
+            query = f"SELECT DISTINCT like_chunk, like_local FROM redundant WHERE {_OTHER_SESSION}"
+            self._superseding = set(self._connection.rows(query))
+        where = f"like_chunk = ? AND like_local = ? AND {_OTHER_SESSION}"
+        return [row for key in keys if key in self._superseding for row in self._rows.all(where, key)]
+
     def seen_like(self, key: Key) -> SeenRuns:
-        """Return when those are seen that are the same instance as a local instance."""
+        """Return when those of the same session are seen that are the same instance as a local instance."""
         self.chunks()
         return self._seen.get(key) or self._seen.put(
             key, seen_together([runs_seen(row.key[0], row.frames) for row in self.like([key])])
@@ -293,13 +318,25 @@ class Redundant:
                 self._seen.put(row.like, seen_together([seen, runs_seen(row.key[0], row.frames)]))
         self._known = known | {chunk_id} if all_of_it else known - {chunk_id}
 
+    def supersede(self, instances: Sequence[RedundantInstance], chunk_ids: Collection[int]) -> None:
+        """Add local instances that later sessions saw again, and those that rested on them, which now rest on what
+        these are like; `chunk_ids` are chunks of which nothing is left.
+        """
+        known = set(self.chunks())
+        self._rows.add_all(instances)
+        to = "UPDATE redundant SET like_chunk = ?, like_local = ? WHERE like_chunk = ? AND like_local = ?"
+        moved = [(*row.like, *row.key) for row in instances if row.like != row.key]
+        self._connection.execute_many(f"{to} AND {_OTHER_SESSION}", moved)
+        self._known = known | set(chunk_ids)
+        self._turn()
+
     def forget(self) -> None:
         """Read the rows again when they are next asked for."""
         self._known = None
         self._turn()
 
     def _turn(self) -> None:
-        self._seen = _SeenCache()
+        self._seen, self._superseding = _SeenCache(), None
         self.turned += 1
 
 
