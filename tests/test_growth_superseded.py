@@ -77,6 +77,12 @@ def test_a_memory_of_many_sessions_says_what_it_says_with_all_that_they_saw(stor
             film(store, room, settings)
         assert told(last) == told(every), n
     assert {e.kind for e in last.events.all()} == {"seen_again", "moved", "removed", "added"}
+    away = last.observations.owners([(3, 1)])[3, 1]
+    assert [(e.session_id, e.kind, e.from_box is None) for e in last.events.all() if e.instance_id == away] == [
+        (2, "seen_again", False),
+        (3, "removed", False),
+        (6, "added", True),
+    ]
     old = {row.key for row in last.library.redundant.superseded()}
     assert len(old) > 30 and not every.library.redundant.superseded()
     assert len(last.library.overlaps.all()) < 0.7 * len(every.library.overlaps.all())

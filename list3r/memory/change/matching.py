@@ -199,13 +199,15 @@ class ChangeMatching:
     def _seen(self, placed: _PlacedInstance, places: list[int], session: int) -> None:
         p = self._p
         place = placed.now if placed.now in places else max(places, key=lambda n: (p.frames_in(n, session), -n))
-        kind = "seen_again" if place == placed.now else "moved"
-        before = p.box(placed.now, session, before=True, stayed=True)
+        kind, reason = ("seen_again" if place == placed.now else "moved"), "its surface was found at its place in"
+        before: OrientedBox | None = p.box(placed.now, session, before=True, stayed=True)
+        if placed.state == "removed":
+            kind, reason, before = "added", "it was gone, and its surface was found again in", None
         after = p.box(place, session, before=False, stayed=True)
-        placed.now, placed.state = place, "present" if kind == "seen_again" else "moved"
+        placed.now, placed.state = place, "present" if kind == "seen_again" else kind
         if self._counts[place]:
             frames = p.frames_in(place, session)
-            reason = f"its surface was found at its place in {frames} frames"
+            reason = f"{reason} {frames} frames"
             sure = frames / (frames + self._s.half_sure_frames)
             self._record(
                 placed,

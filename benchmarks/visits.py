@@ -1,0 +1,145 @@
+"""A simulated home filmed many times, other things moved, removed and added each time; with and without what later
+sessions saw again.
+
+python benchmarks/visits.py --seeds 1,2 --json benchmarks/results/visits.json
+
+The walks go this way and that, in one memory. A local instance that as many later sessions as the row says saw again is
+looked at no more (`RedundancySettings.sessions`; 0: all are). After each visit the things that the memory lists are
+held against the truth of that visit, by boxes, and the events that it tells of the visit against what was done since
+the one before, as in `sessions.py`. `left_out` counts local instances that are looked at no more, `pairs` the pairs of
+chunks that are; what is counted over visits is those from `--from` on, before which nothing is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from machine import machine, write_json
+from sessions import KINDS, ReturnWalk, measure
+
+import list3r
+from benchmarks.simulation.changes import random_changes
+from benchmarks.simulation.walks import ChangedWalk
+from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
+from list3r.memory.store.store import Store
+from list3r.pipeline.settings import BuildSettings
+from list3r.simulation.dataset import WalkSettings, write_walk
+from list3r.simulation.worlds.world import SimulatedWorld
+
+DONE = {"moved": 2, "removed": 1, "added": 1}
+"""What is done to the home as it first was, before each visit but the first."""
+
+
+@dataclass(frozen=True)
+class VisitWalk(ChangedWalk):
+    """The same rooms at another visit: what was added for it is at no other."""
+
+    visit: int = 1
+
+    def world(self) -> SimulatedWorld:
+        """The world of the visit."""
+        known = {t.id for t in WalkSettings(seed=self.seed).world().things}
+        world = super().world()
+        added = (replace(t, id=t.id if t.id in known else 100 * self.visit + t.id) for t in world.things)
+        return replace(world, things=tuple(added))
+
+
+class BackWalk(VisitWalk, ReturnWalk):
+    """The same the other way round."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="1,2")
+    parser.add_argument("--visits", type=int, default=7)
+    parser.add_argument("--from", type=int, default=5, dest="first", help="visit from which it is counted")
+    parser.add_argument("--later", default="0,3", help="later sessions after which a local instance is left out")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--keep", type=Path, help="folder in which walks are kept")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed in map(int, args.seeds.split(",")):
+            walks = [filmed((args.keep or Path(scratch)) / str(seed), seed, n) for n in range(1, args.visits + 1)]
+            for later in map(int, args.later.split(",")):
+                memory = Path(scratch) / f"{seed}-{later}.l3r"
+                for n in range(1, args.visits + 1):
+                    rows.append(
+                        {"later": later, "seed": seed, "visit": n, **visited(memory, walks[:n], later, args.workers)}
+                    )
+                    print(json.dumps(rows[-1]), flush=True)
+    counted = [r for r in rows if r["visit"] >= args.first]
+    table = {
+        later: total([r for r in counted if r["later"] == later]) for later in dict.fromkeys(r["later"] for r in rows)
+    }
+    print(machine())
+    print(json.dumps(table, indent=1))
+    write_json(args.json, {"from": args.first, "total": table, "visits": rows})
+
+
+def filmed(root: Path, seed: int, visit: int) -> Path:
+    """The folder of a walk, filmed unless it is there."""
+    walk, first = root / str(visit), WalkSettings(seed=seed)
+    if (walk / "truth.json").exists():
+        return walk
+    if visit == 1:
+        write_walk(walk, first)
+        return walk
+    kind = BackWalk if visit % 2 == 0 else VisitWalk
+    changes = random_changes(first.world(), 100 * seed + visit, **DONE)
+    write_walk(walk, kind(seed=seed, walk_seed=1000 * visit + seed, start=20 * visit, changes=changes, visit=visit))
+    return walk
+
+
+def visited(memory: Path, walks: Sequence[Path], later: int, workers: int) -> dict[str, Any]:
+    """Add the last walk to the memory of those before, and measure what it tells then."""
+    library = ConsolidationSettings(redundancy=RedundancySettings(sessions=later))
+    settings = BuildSettings(library=library, poses="estimate")
+    if len(walks) == 1:
+        list3r.build(walks[0], memory, settings=settings, workers=workers, force=True).close()
+        return {}
+    before = memory.with_suffix(".before.l3r")
+    before.write_bytes(memory.read_bytes())
+    list3r.update(memory, walks[-1], workers=workers).close()
+    with Store.open(before) as one, Store.open(memory) as two:
+        found = measure(one, two, walks)
+        left_out, pairs = len(two.library.redundant.superseded()), len(two.library.overlaps.all())
+    return {
+        "events": found["events"],
+        "false": found["false"],
+        "missed": found["missed"],
+        "last": found["last"],
+        "ids_kept": found["ids_kept"],
+        "unchanged": found["unchanged"],
+        "left_out": left_out,
+        "pairs": pairs,
+    }
+
+
+def total(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """All visits together."""
+    out: dict[str, Any] = {
+        "ids_kept": round(sum(r["ids_kept"] for r in rows) / max(sum(r["unchanged"] for r in rows), 1), 4)
+    }
+    for kind in (*KINDS, "all"):
+        of = KINDS if kind == "all" else (kind,)
+        s = {n: sum(r["events"][k][n] for r in rows for k in of) for n in ("hit", "false", "missed")}
+        out[kind] = {**s, "f1": round(2 * s["hit"] / max(2 * s["hit"] + s["false"] + s["missed"], 1), 4)}
+    for name in rows[0]["last"] if rows else ():
+        counts: Counter[str] = Counter()
+        for row in rows:
+            counts.update(row["last"][name])
+        out[name] = dict(counts)
+    return out
+
+
+if __name__ == "__main__":
+    main()
