@@ -15,12 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from machine import machine, write_json
 from sessions import KINDS, ReturnWalk, measure
 
@@ -29,6 +31,7 @@ from benchmarks.simulation.changes import random_changes
 from benchmarks.simulation.walks import ChangedWalk
 from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
 from list3r.memory.store.store import Store
+from list3r.pipeline import mapping
 from list3r.pipeline.settings import BuildSettings
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.worlds.world import SimulatedWorld
@@ -108,7 +111,19 @@ def visited(memory: Path, walks: Sequence[Path], later: int, workers: int) -> di
         return {}
     before = memory.with_suffix(".before.l3r")
     before.write_bytes(memory.read_bytes())
-    list3r.update(memory, walks[-1], workers=workers).close()
+    consolidate, spent = mapping.consolidate, list[float]()
+
+    def timed(*arguments: Any) -> Any:
+        started = time.process_time()
+        report = consolidate(*arguments)
+        spent.append(time.process_time() - started)
+        return report
+
+    mapping.consolidate = timed  # type: ignore[assignment]
+    try:
+        list3r.update(memory, walks[-1], workers=workers).close()
+    finally:
+        mapping.consolidate = consolidate
     with Store.open(before) as one, Store.open(memory) as two:
         found = measure(one, two, walks)
         left_out, pairs = len(two.library.redundant.superseded()), len(two.library.overlaps.all())
@@ -119,6 +134,8 @@ def visited(memory: Path, walks: Sequence[Path], later: int, workers: int) -> di
         "last": found["last"],
         "ids_kept": found["ids_kept"],
         "unchanged": found["unchanged"],
+        "chunk_s": round(float(np.median(spent[:-1])), 2),
+        "end_s": round(spent[-1], 2),
         "left_out": left_out,
         "pairs": pairs,
     }

@@ -94,7 +94,7 @@ def _redundant(region: Region, k: int) -> list[RedundantInstance]:
     if settings.chunks == 0 or len(earlier) < settings.chunks:
         return []
     shapes = summary.shapes
-    known, beside = _seen_by(region, k, [(u,) for u in earlier], settings.chunks)
+    known, beside = _seen_by(region, k, earlier, settings.chunks)
     known &= ~np.isin(shapes.local_id, list(summary.motions))
     if not len(shapes.points) or not known[shapes.owner].any():
         return []
@@ -106,31 +106,26 @@ def _redundant(region: Region, k: int) -> list[RedundantInstance]:
     ]
 
 
-def _seen_by(
-    region: Region, k: int, others: Sequence[Collection[int]], enough: int
-) -> tuple[NDArray[np.bool_], list[int]]:
-    """Return of which local instances of a chunk `enough` of some sets of chunks saw the surface, and the chunks that
-    saw most of the surface of one of them.
+def _seen_by(region: Region, k: int, others: Sequence[int], enough: int) -> tuple[NDArray[np.bool_], list[int]]:
+    """Return of which local instances of a chunk `enough` of some other chunks saw the surface, and those of them that
+    saw most of the surface of one of these.
     """
     settings, shapes = region.settings.redundancy, region.summaries[k].shapes
     points = region.settled[k].S_graph_chunk.apply(shapes.points)
     total = np.bincount(shapes.owner, minlength=len(shapes.local_id))
     times, known, grown = np.zeros(len(points), np.int64), total == 0, region.store.derived.of(GrownCells)
     met: dict[int, Ints] = {}
-    for chunks in others:
-        seen = np.zeros(len(points), bool)
-        for u in chunks:
-            row = region.rows[u]
-            asked = ~known[shapes.owner] & (times < enough) & ~seen
-            asked &= ((points >= row.extent[0]) & (points <= row.extent[1])).all(axis=1)
-            at = np.flatnonzero(asked)
-            if not len(at):
-                continue
-            placed = row.S_graph_chunk.inverse().apply(points[at])
-            found = at[lies_on(placed, region.still(u), grown)]
-            seen[found] = True
-            met[u] = np.bincount(shapes.owner[found], minlength=len(total))
+    for u in others:
+        row = region.rows[u]
+        asked = ~known[shapes.owner] & (times < enough)
+        asked &= ((points >= row.extent[0]) & (points <= row.extent[1])).all(axis=1)
+        at = np.flatnonzero(asked)
+        if not len(at):
+            continue
+        placed = row.S_graph_chunk.inverse().apply(points[at])
+        seen = at[lies_on(placed, region.still(u), grown)]
         times[seen] += 1
+        met[u] = np.bincount(shapes.owner[seen], minlength=len(total))
         often = np.bincount(shapes.owner, times >= enough, minlength=len(total))
         known = often >= settings.covered * total
         if known.all():
@@ -168,7 +163,7 @@ def _still_superseded(region: Region, k: int, rows: Sequence[RedundantInstance])
 
 def superseded(region: Region, groups: Iterable[Group], spared: Collection[Key]) -> list[RedundantInstance]:
     """Return the members of groups that need not be looked at any more: enough later sessions saw the instance again,
-    and the surface of the member; those `spared` stay.
+    and together the surface of the member; those `spared` stay.
     """
     settings, wanted = region.settings.redundancy, dict[int, dict[int, Group]]()
     later: dict[Key, Group] = {}
@@ -186,10 +181,8 @@ def superseded(region: Region, groups: Iterable[Group], spared: Collection[Key])
 
 def _superseded(region: Region, k: int, wanted: Mapping[int, Group]) -> list[RedundantInstance]:
     """Return the same of one chunk; its local instances that are asked about with the later members of their groups."""
-    by_session: dict[int, list[int]] = {}
-    for u in sorted({u for kept in wanted.values() for u, _ in kept}, reverse=True):
-        by_session.setdefault(_session(region, (u, 0)), []).append(u)
-    known, beside = _seen_by(region, k, list(by_session.values()), region.settings.redundancy.sessions)
+    later = sorted({u for kept in wanted.values() for u, _ in kept}, reverse=True)
+    known, beside = _seen_by(region, k, later, 1)
     shapes = region.summaries[k].shapes
     known &= np.isin(shapes.local_id, list(wanted))
     like = _like(region, k, shapes.only(known), beside) if known.any() else {}

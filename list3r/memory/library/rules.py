@@ -40,9 +40,9 @@ class RedundancySettings:
     chunks: int = 12
     """Earlier chunks of its session that must have seen its surface, as one thing or in pieces; 0: none is so."""
     sessions: int = 3
-    """Later sessions that must have seen it again, and its surface so; 0: none is so."""
+    """Later sessions that must have seen it again, and its surface together; 0: none is so."""
     covered: float = 0.75
-    """Share of its surface that so many must have seen."""
+    """Share of its surface that they must have seen."""
 
 
 @dataclass(frozen=True)

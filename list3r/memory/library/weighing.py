@@ -57,7 +57,7 @@ class Weighing:
         that lie within it.
         """
         out = Weighed()
-        changed = list(changed)
+        changed, left = list(changed), [k for k in left if self._region.takes_part(k)]
         self._g.look_up(k for k, _ in left)
         wanted = {*changed, *self._against(changed), *(self._g.home[k] for k in left), *self._looked_at()}
         while True:
