@@ -7,7 +7,8 @@ The walks go this way and that, in one memory. A local instance that as many lat
 looked at no more (`RedundancySettings.sessions`; 0: all are). After each visit the things that the memory lists are
 held against the truth of that visit, by boxes, and the events that it tells of the visit against what was done since
 the one before, as in `sessions.py`. `left_out` counts local instances that are looked at no more, `pairs` the pairs of
-chunks that are; what is counted over visits is those from `--from` on, before which nothing is left out.
+chunks that are; `library_s` is processor time of the library, seconds. The totals count the visits from `--from` on,
+before which nothing is left out.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from machine import machine, write_json
 from sessions import KINDS, ReturnWalk, measure
 
@@ -134,8 +134,7 @@ def visited(memory: Path, walks: Sequence[Path], later: int, workers: int) -> di
         "last": found["last"],
         "ids_kept": found["ids_kept"],
         "unchanged": found["unchanged"],
-        "chunk_s": round(float(np.median(spent[:-1])), 2),
-        "end_s": round(spent[-1], 2),
+        "library_s": round(sum(spent), 2),
         "left_out": left_out,
         "pairs": pairs,
     }

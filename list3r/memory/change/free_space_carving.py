@@ -13,7 +13,7 @@ import numpy as np
 
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.merging.edges import PairScores
-from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, chunk_views, seen_through_share
+from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, chunk_views, seen_through_shares
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.store.store import Store
 
@@ -39,11 +39,13 @@ class FreeSpaceCarving:
 
     def _of(self, own: ChunkShapes, other: ChunkShapes, at: np.ndarray, meet: np.ndarray, S_other_own: Sim3) -> Array:
         out = np.zeros(len(at))
-        for n in np.unique(at[meet]).tolist():
-            if not own.structure[n]:
-                start, stop = np.searchsorted(own.owner, [n, n + 1])
-                points = S_other_own.apply(own.points[start:stop])
-                out[meet & (at == n)] = seen_through_share(points, self._views_of(other), self._s) or 0.0
+        some = [n for n in np.unique(at[meet]).tolist() if not own.structure[n]]
+        if some:
+            spans = np.searchsorted(own.owner, np.add.outer(some, (0, 1)))
+            surfaces = [S_other_own.apply(own.points[start:stop]) for start, stop in spans.tolist()]
+            shares = seen_through_shares(surfaces, self._views_of(other), self._s)
+            for n, share in zip(some, shares, strict=True):
+                out[meet & (at == n)] = share or 0.0
         return out
 
     def _views_of(self, shapes: ChunkShapes) -> list[DepthView]:

@@ -128,27 +128,15 @@ UNTOLD, MET, FREE = 0, 1, 2
 
 
 def point_visibility(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.int8]:
-    """Return what one frame tells about each point of a surface, world coordinates. Shapes (N, 3) -> (N,)."""
-    out = np.zeros(len(points), np.int8)
-    p = view.S_cam_world.apply(points)
-    fx, fy, cx, cy = view.camera
-    height, width = view.depth.shape
-    z = p[:, 2] / view.unit
-    near = np.flatnonzero((z > s.nearest_m) & (z < s.most_depth_m))
-    p = p[near]
-    column, row = np.rint(p[:, 0] / p[:, 2] * fx + cx), np.rint(p[:, 1] / p[:, 2] * fy + cy)
-    inside = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
-    p, column, row = p[inside], column[inside].astype(np.int64), row[inside].astype(np.int64)
-    if len(p) == 0:
-        return out
-    around = np.stack([view.depth[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]) / view.unit
-    z = p[:, 2] / view.unit
-    slack = s.tolerance_m + s.noise_per_m2 * z**2
-    met = (np.abs(around - z) <= slack).any(axis=0)
-    known = (around > 0).sum(axis=0) >= 6
-    free = known & (np.where(around > 0, around, np.inf) > z + slack).all(axis=0)
-    out[near[inside]] = np.where(met, MET, np.where(free, FREE, UNTOLD))
-    return out
+    """Return what one frame tells about each point of a surface, world coordinates: `UNTOLD`, `MET` or `FREE`.
+
+    Shapes (N, 3) -> (N,).
+    """
+    from list3r.memory.overlap.kernels import tell  # questions to a memory do without numba
+
+    slack, reach = (s.tolerance_m, s.noise_per_m2), (s.nearest_m, s.most_depth_m)
+    p = np.ascontiguousarray(view.S_cam_world.apply(points))
+    return tell(p, float(view.unit), np.ascontiguousarray(view.depth), view.camera, slack, reach)
 
 
 def in_sight_of(views: Sequence[DepthView], s: VisibilitySettings) -> Array:
@@ -189,9 +177,20 @@ def seen_through_share(points: Array, views: Iterable[DepthView], s: VisibilityS
     """Return the share of a surface that more frames see through than see, of what they tell of; None where that is too
     little.
     """
-    free, met = tally(points, views, s)
-    known = free + met > 0
-    return float(np.mean(free[known] > met[known])) if known.sum() >= s.least_points else None
+    return seen_through_shares([points], views, s)[0]
+
+
+def seen_through_shares(
+    surfaces: Sequence[Array], views: Iterable[DepthView], s: VisibilitySettings
+) -> list[float | None]:
+    """Return the same of several surfaces, about which each frame is asked once."""
+    free, met = tally(np.concatenate(surfaces), views, s)
+    ends = np.cumsum([len(points) for points in surfaces])
+    out: list[float | None] = []
+    for f, m in zip(np.split(free, ends[:-1]), np.split(met, ends[:-1]), strict=True):
+        known = f + m > 0
+        out.append(float(np.mean(f[known] > m[known])) if known.sum() >= s.least_points else None)
+    return out
 
 
 def _counts(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
