@@ -130,7 +130,7 @@ def test_a_session_in_a_world_of_its_own_changes_nothing(tmp_path: Path) -> None
         assert len({i.component for i in store.instances.all()}) == 2
 
 
-def test_what_came_back_is_seen_again_under_its_id(memory: Path) -> None:
+def test_what_came_back_is_added_under_its_id(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         ids = store.facts[IDS]
         with store.transaction():
@@ -138,7 +138,7 @@ def test_what_came_back_is_seen_again_under_its_id(memory: Path) -> None:
             place_together(store)
             consolidate(store)
         kinds = {e.instance_id: e.kind for e in store.events.all(3)}
-        assert kinds[ids["green"]] == "seen_again"
+        assert kinds[ids["green"]] == "added"
         assert kinds[ids["blue"]] == "moved"
         now = _named(store.instances.all())
         np.testing.assert_allclose(now["blue"].center, [0.5, 0.2, 0.80], atol=0.02)
