@@ -27,23 +27,24 @@ def tell(
     out = np.zeros(len(p), np.int8)
     fx, fy, cx, cy = camera
     height, width = depth.shape
-    metre = np.float32(unit)
     for n in range(len(p)):
         z = p[n, 2] / unit
         if not reach[0] < z < reach[1]:
             continue
         column, row = np.rint(p[n, 0] / p[n, 2] * fx + cx), np.rint(p[n, 1] / p[n, 2] * fy + cy)
-        if not (1 <= column < width - 1 and 1 <= row < height - 1):
-            continue
-        u, v = int(column), int(row)
-        most = slack[0] + slack[1] * z**2
-        met, known, free = False, 0, True
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                there = depth[v + i, u + j] / metre
-                met |= abs(there - z) <= most
-                if there > 0:
-                    known += 1
-                    free &= there > z + most
-        out[n] = MET if met else FREE if free and known >= 6 else UNTOLD
+        if 1 <= column < width - 1 and 1 <= row < height - 1:
+            out[n] = _verdict(depth, int(row), int(column), np.float32(unit), z, slack[0] + slack[1] * z**2)
     return out
+
+
+@compiled
+def _verdict(depth: NDArray[np.float32], row: int, column: int, metre: np.float32, z: float, slack: float) -> int:
+    """Return what a pixel and its neighbours tell about a surface at depth z, metres."""
+    met, known, free = False, 0, True
+    for k in range(9):
+        there = depth[row + k // 3 - 1, column + k % 3 - 1] / metre
+        met |= abs(there - z) <= slack
+        if there > 0:
+            known += 1
+            free &= there > z + slack
+    return MET if met else FREE if free and known >= 6 else UNTOLD
