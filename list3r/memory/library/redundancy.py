@@ -215,7 +215,7 @@ def follow(region: Region, moved: Collection[int], culled: Culled, written: Coll
     store.observations.forget(row.key for row in rows if row.like not in owners)
     store.observations.set(Observation(owners[row.like], *row.key) for row in rows if row.like in owners)
     ids = sorted(set(owners.values()) - set(written))
-    ledger = read_ledger(store, store.chunks.all()) or ChangeLedger(0)
+    ledger = (read_ledger(store, store.chunks.all()) if ids else None) or ChangeLedger(0)
     seen = {n: sightings(region, ledger.current(_members(region, n))) for n in ids}
     store.instances.put(s.on(i) for i in store.instances.of(ids) if (s := seen[i.id]) is not None)
     return set(ids)
