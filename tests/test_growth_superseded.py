@@ -143,3 +143,22 @@ def test_an_operator_parts_what_is_looked_at_no_more(stores: tuple[Store, Store]
     assert {(1, 2), (2, 2)}.isdisjoint({row.key for row in last.library.redundant.superseded()})
     edits.undo(last, None, "somebody")
     assert set(last.observations.owners([(1, 2), (2, 2), (4, 2)]).values()) == {owner} and last.verify() == []
+
+
+def test_a_chunk_that_moves_as_a_session_ends_leaves_what_that_session_supersedes(stores: tuple[Store, Store]) -> None:
+    _, last = stores
+    for _ in range(2):
+        film(last, ROOMS[0], LAST)
+    with last.transaction():
+        session = last.sessions.add("simulated", "third", {}, FRAMES)
+        chunk_id = last.chunks.add(session, simulated_chunk(ROOMS[0], cameras((0.0, 0.0, 0.75), 0.7), 0))
+        last.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
+        consolidate(last, chunk_id, LAST)
+    home = last.observations.owners([(5, n) for n in range(4)])
+    with last.transaction():
+        last.chunks.place({4: Sim3.exp(np.array([0.0, 40.0, 0.0, 0, 0, 0, 0]))}, {4: 1})
+        consolidate(last, settings=LAST)
+    assert {row.key[0] for row in last.library.redundant.superseded()} == {1, 2}
+    assert {(1, n): k for (_, n), k in home.items()} == last.observations.owners([(1, n) for n in range(4)])
+    assert set(last.observations.owners([(4, n) for n in range(4)]).values()).isdisjoint(home.values())
+    assert last.verify() == []
