@@ -162,3 +162,26 @@ def test_a_chunk_that_moves_as_a_session_ends_leaves_what_that_session_supersede
     assert {(1, n): k for (_, n), k in home.items()} == last.observations.owners([(1, n) for n in range(4)])
     assert set(last.observations.owners([(4, n) for n in range(4)]).values()).isdisjoint(home.values())
     assert last.verify() == []
+
+
+def test_what_is_left_out_as_soon_as_it_is_recognised_leaves_its_id(stores: tuple[Store, Store]) -> None:
+    every, last = stores
+    far = Sim3.exp(np.array([0.0, 40.0, 0.0, 0, 0, 0, 0]))
+    for store, settings in ((every, EVERY), (last, LAST)):
+        for number in range(3):
+            with store.transaction():
+                session = store.sessions.add("simulated", f"{number}", {}, FRAMES)
+                chunk_id = store.chunks.add(session, simulated_chunk(ROOMS[0], cameras((0.0, 0.0, 0.75), 0.4), 0))
+                store.chunks.place({chunk_id: Sim3.identity() if number else far}, {chunk_id: 1})
+                consolidate(store, chunk_id, settings)
+            with store.transaction():
+                if number == 2:
+                    store.chunks.place({1: Sim3.identity()}, {1: 1})
+                consolidate(store, settings=settings)
+                store.sessions.complete(session)
+        first = store.observations.owners([(1, n) for n in range(4)])
+        assert sorted(first.values()) == [1, 2, 3, 4]
+        assert store.observations.owners([(3, n) for n in range(4)]) == {(3, n): k for (_, n), k in first.items()}
+        assert store.verify() == []
+    assert {row.key[0] for row in last.library.redundant.superseded()} == {1}
+    assert told(last) == told(every)

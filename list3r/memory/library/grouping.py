@@ -12,6 +12,7 @@ from list3r.memory.merging.edges import NONE, form_groups
 from list3r.memory.merging.movers import Mover, join_movers, tied_movers
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.records import MergeDecision
+from list3r.memory.store.tables.library import RedundantInstance
 
 
 class Grouping:
@@ -25,6 +26,8 @@ class Grouping:
         self.before: dict[Key, Group] = {}
         """The same at the last derivation."""
         self.shown_before: dict[Group, bool] = {}
+        self.left_out: Sequence[RedundantInstance] = ()
+        """What is in no group from now on, since later sessions saw it again."""
         self._known: set[int] = set()
         self._movers: dict[Group, Mover] = {}
 

@@ -147,8 +147,10 @@ class Region:
         return shapes.frames[int(np.searchsorted(shapes.local_id, key[1]))]
 
     def seen_for(self, key: Key) -> int:
-        """Return in how many frames of the recording a local instance is seen, passed over ones included."""
-        shapes = self.shapes(key[0])
+        """Return in how many frames of the recording a local instance, even a redundant one, is seen, passed over ones
+        included.
+        """
+        shapes = self.summaries[key[0]].shapes
         return shapes.seen_for(int(np.searchsorted(shapes.local_id, key[1])))
 
     def pose(self, chunk_id: int) -> Sim3:

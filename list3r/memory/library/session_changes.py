@@ -70,6 +70,7 @@ class SessionChanges:
         )
         fresh = superseded(region, still, edited_since(self._store, 0))
         region.supersede(fresh)
+        self._g.left_out = fresh
         gone = {row.key for row in (*old, *fresh)}
         self._found = found.without(gone)
         places = [tuple(k for k in g if k not in gone) for g in places]

@@ -132,7 +132,11 @@ class Weighing:
         before = without_missed(before, groups, [weighed.evidence.get(g, _UNWEIGHED) for g in groups], visible)
         within = [None if (w := inner.get(g)) is None else at[w] for g in groups]
         weights = {key: self._region.seen_for(key) for key in keys}
-        ids = assign_ids(groups, before, weights, visible, within, self._region.store.ids.next())
+        left = {row.key: at[g] for row in self._g.left_out if (g := self._g.home[row.like]) in at}
+        owners = self._region.store.observations.owners(sorted(left))
+        weights |= {key: self._region.seen_for(key) for key in owners}
+        whole = [[*g, *(key for key in owners if left[key] == n)] for n, g in enumerate(groups)]
+        ids = assign_ids(whole, {**before, **owners}, weights, visible, within, self._region.store.ids.next())
         return Named(ids, groups, before)
 
     # ------------------------------------------------------------------ points that belong to something else

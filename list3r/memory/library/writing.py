@@ -68,8 +68,8 @@ class Writer:
         for n in gone:
             store.instances.drop(n, dict(ids.aliases).get(n))
         now = {key: n for n, g in fresh.items() for key in g}
-        turned = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
-        like = followers(store, turned)
+        turned = {key for key in {*before, *now} if before.get(key) != now.get(key)}
+        like = followers(store, sorted(turned | {row.like for row in self._g.left_out}))
         before |= store.observations.owners([row.key for row in like])
         for row in like:
             now |= {row.key: now[row.like]} if row.like in now else {}
