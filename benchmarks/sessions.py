@@ -19,6 +19,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -99,8 +100,30 @@ def one_home(root: Path, seed: int, workers: str, discovery: str = "") -> dict[s
     return {"placed": report["placed"], "chunks": report["chunks"], "ties": report["ties"], **usage, **figures}
 
 
-def measure(before: Store, after: Store, walks: Sequence[Path]) -> dict[str, Any]:
-    """Placement, ids and events of an updated memory against the truth of the walks in it, before and with the last."""
+@dataclass(frozen=True)
+class Due:
+    """What a memory could tell of a walk."""
+
+    changes: set[tuple[str, int]]
+    """Kind and thing."""
+    besides: set[tuple[str, int]]
+    """What counts neither way."""
+    scenes: Sequence[dict[str, Any]]
+    """Where things were when they were last seen before, and where they are."""
+
+    @staticmethod
+    def of(scenes: Sequence[dict[str, Any]]) -> Due:
+        """Return what was done between two walks."""
+        done = _changes(scenes)
+        faint = _changes(scenes, 0) - done
+        faint |= {(kind, t) for k, t in faint if k == "moved" for kind in ("removed", "added")}
+        return Due(done, faint, scenes)
+
+
+def measure(before: Store, after: Store, walks: Sequence[Path], due: Due | None = None) -> dict[str, Any]:
+    """Placement, ids and events of an updated memory against the truth of the walks in it, before and with the last;
+    the events against what was done since the walk before it, or what was `due`.
+    """
     last = len(walks)
     truth = [read_tum(walk / "groundtruth.txt") for walk in (walks[0], walks[-1])]
     scenes = [read_scene(walk / "truth.json") for walk in walks[-2:]]
@@ -111,12 +134,12 @@ def measure(before: Store, after: Store, walks: Sequence[Path]) -> dict[str, Any
     was = {e: t for t, e, _ in first["matched_ids"]}
     second = evaluate_scene(_scene(after), scenes[1], S_truth_two)
     now = {e: t for t, e, _ in second["matched_ids"]}
-    done = _changes(scenes)
+    due = due or Due.of(scenes)
+    done = due.changes
     unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
     kept = sum(now.get(after.ids.resolve(i)) == t for i, t in unchanged)
-    told = {_told(e, was, now, scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
-    faint = _changes(scenes, 0) - done
-    told -= faint | {(kind, t) for k, t in faint if k == "moved" for kind in ("removed", "added")}
+    told = {_told(e, was, now, due.scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
+    told -= due.besides
     wrong = sorted((k, t) for k, t in told - done)
     known = {t for t in was.values()} | {t for k, t in done if k == "added"}
     return {

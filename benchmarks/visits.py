@@ -5,10 +5,10 @@ python benchmarks/visits.py --seeds 1,2 --json benchmarks/results/visits.json
 
 The walks go this way and that, in one memory. A local instance that as many later sessions as the row says saw again is
 looked at no more (`RedundancySettings.sessions`; 0: all are). After each visit the things that the memory lists are
-held against the truth of that visit, by boxes, and the events that it tells of the visit against what was done since
-the one before, as in `sessions.py`. `left_out` counts local instances that are looked at no more, `pairs` the pairs of
-chunks that are; `library_s` is processor time of the library, seconds. The totals count the visits from `--from` on,
-before which nothing is left out.
+held against the truth of that visit, by boxes, and the events that it tells of the visit against what the camera could
+be the first to see then (`known_places.py`), as in `sessions.py`. `left_out` counts local instances that are looked at
+no more, `pairs` the pairs of chunks that are; `library_s` is processor time of the library, seconds. The totals count
+the visits from `--from` on, before which nothing is left out.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from known_places import KnownPlaces
 from machine import machine, write_json
 from sessions import KINDS, ReturnWalk, measure
 
@@ -72,12 +73,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for seed in map(int, args.seeds.split(",")):
             walks = [filmed((args.keep or Path(scratch)) / str(seed), seed, n) for n in range(1, args.visits + 1)]
+            known = KnownPlaces(walks)
             for later in map(int, args.later.split(",")):
                 memory = Path(scratch) / f"{seed}-{later}.l3r"
                 for n in range(1, args.visits + 1):
-                    rows.append(
-                        {"later": later, "seed": seed, "visit": n, **visited(memory, walks[:n], later, args.workers)}
-                    )
+                    found = visited(memory, walks[:n], known, later, args.workers)
+                    rows.append({"later": later, "seed": seed, "visit": n, **found})
                     print(json.dumps(rows[-1]), flush=True)
     counted = [r for r in rows if r["visit"] >= args.first]
     table = {
@@ -102,7 +103,7 @@ def filmed(root: Path, seed: int, visit: int) -> Path:
     return walk
 
 
-def visited(memory: Path, walks: Sequence[Path], later: int, workers: int) -> dict[str, Any]:
+def visited(memory: Path, walks: Sequence[Path], known: KnownPlaces, later: int, workers: int) -> dict[str, Any]:
     """Add the last walk to the memory of those before, and measure what it tells then."""
     library = ConsolidationSettings(redundancy=RedundancySettings(sessions=later))
     settings = BuildSettings(library=library, poses="estimate")
@@ -125,7 +126,7 @@ def visited(memory: Path, walks: Sequence[Path], later: int, workers: int) -> di
     finally:
         mapping.consolidate = consolidate
     with Store.open(before) as one, Store.open(memory) as two:
-        found = measure(one, two, walks)
+        found = measure(one, two, walks, known.due(len(walks) - 1))
         left_out, pairs = len(two.library.redundant.superseded()), len(two.library.overlaps.all())
     return {
         "events": found["events"],
