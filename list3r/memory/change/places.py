@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from list3r.memory.change.records import ChangeSettings
 from list3r.memory.change.surface_colors import (
+    HALF_LIGHT,
     SAME_LIGHT,
     Colors,
     LightBetween,
@@ -92,6 +93,7 @@ class Places:
         self._sights: dict[tuple[int, int], Array] = {}
         self._stayed: dict[tuple[int, int], OrientedBox] = {}
         self._frames: dict[tuple[int, int], int] = {}
+        self._summaries: dict[int, tuple[float, Array]] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
@@ -190,13 +192,18 @@ class Places:
         return self._look(points, self._views_of(session, self.component[n]), session)
 
     def look_before(self, n: int, session: int) -> PlaceVisibility:
-        """Return what the frames of the last session that could tell saw where an instance is now."""
-        points = self.points(n, session, before=False)
+        """Return what the frames of the last session that could tell saw where an instance is now.
+
+        A session of which too few frames tell is passed over where one before it can.
+        """
+        points, doubtful = self.points(n, session, before=False), PlaceVisibility("unseen", 0.0, ())
         for views in self._views_before(n, session):
             found = self._look(points, views, session)
-            if found.verdict != "unseen":
+            if found.verdict == "unclear" and len(found.frames) < self._s.visibility.least_frames:
+                doubtful = found if doubtful.verdict == "unseen" else doubtful
+            elif found.verdict != "unseen":
                 return found
-        return PlaceVisibility("unseen", 0.0, ())
+        return doubtful
 
     def _look(self, points: Array, views: Sequence[DepthView], session: int) -> PlaceVisibility:
         """Return what frames see at a place; nothing is told of what may be there as the session may lie."""
@@ -252,14 +259,31 @@ class Places:
         """Return its looks, the views that show most of it first; what is there all along is left out of its size,
         unless that has other colours now, so that it has not `stayed` where depth says so.
 
-        `before` a session that does not show it there any more, else in the first session that does.
+        `before` a session that does not show it there any more, in all earlier ones, else in the first that does.
         """
         keys = self.members(n, session, before=before, stayed=stayed)
+        if before:
+            keys = [k for k in self.groups[n] if self.rows[k[0]].session_id < session]
+            keys = keys if stayed else self._pure(n, keys, session, before=True)
         weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
         views = [] if stayed else self._views_across(n, session, before=before)
         rgb = [self._colors_of(key)[self._changed_rows(self._points_of(key), views)] for key in keys]
         light = self.light(session) if before else SAME_LIGHT
         return GroupLooks(self._extent(keys, weight, views), light.lab(np.concatenate(rgb)))
+
+    def plainly_other(self, n: int, m: int) -> bool:
+        """Return whether two groups cannot be one instance by the size and the colour that chunks say of them."""
+        (size_a, lab_a), (size_b, lab_b) = self._summed_up(n), self._summed_up(m)
+        ratio = max(size_a, size_b) / max(min(size_a, size_b), 1e-9)
+        color = float(np.linalg.norm((lab_a - lab_b) * HALF_LIGHT))
+        return ratio > self._s.other_size or color > self._s.other_color
+
+    def _summed_up(self, n: int) -> tuple[float, Array]:
+        if n not in self._summaries:
+            rows = [(self.shapes[k], self._at(k, i)) for k, i in self.groups[n]]
+            sizes, labs = [shape.size[at] / shape.unit for shape, at in rows], [shape.lab[at] for shape, at in rows]
+            self._summaries[n] = float(np.median(sizes)), np.median(labs, axis=0)
+        return self._summaries[n]
 
     def light(self, session: int) -> LightBetween:
         """Return how the colours of the sessions before come out in a session, by what both have seen."""

@@ -59,6 +59,8 @@ class ChangeSettings:
     """What of `hue_distance` counts as one squared deviation."""
     most_deviations: float = 12.5
     """Sum of squared deviations up to which two are one instance."""
+    left_unseen: float = 0.1
+    """Chance that an instance has left a place of which frames tell nothing."""
     placed_deviations: float = 2.0
     """Deviations of how surely the sessions lie on each other. Within this many nothing moved, and what is gone must
     be gone wherever the session may lie (decision 0058)."""

@@ -21,7 +21,7 @@ from list3r.memory.overlap.pair_scores import PairScores
 from list3r.memory.overlap.voxels import ChunkShapes
 
 Colors = NDArray[np.uint8]
-_HALF_LIGHT = np.array([0.5, 1.0, 1.0])
+HALF_LIGHT = np.array([0.5, 1.0, 1.0])
 _HUE_CELL, _HUE_CELLS = 0.08, 48
 _LEAST_POINTS, _LEAST_SURFACE = 12, 200
 """Points that must meet, for two instances to be compared, and for the light of two sessions."""
@@ -59,7 +59,7 @@ SAME_LIGHT = LightBetween(np.ones(3), 0.0)
 
 def lab(rgb: NDArray[Any]) -> Array:
     """Return CIE L*a*b* with lightness at half weight, which shading changes most. Shape (N, 3)."""
-    return np.asarray(lab_from_rgb(rgb) * _HALF_LIGHT)
+    return np.asarray(lab_from_rgb(rgb) * HALF_LIGHT)
 
 
 def color_distance(a: Array, b: Array) -> Array:
