@@ -36,10 +36,12 @@ class ChangeMatching:
         """New instances that stand where others stood, and those others."""
         self._events: list[tuple[int, Change]] = []
         self._decisions: list[MergeDecision] = []
+        self._told_gone: set[int] = set()
+        """First places of instances that were told to be gone."""
         self._vacated: dict[int, OrientedBox] = {}
         """Places whose instances a session found at other places that they had before."""
         self._elsewhere: list[PlacedInstance] = []
-        """Instances that a session did not find, and that earlier ones found gone or its frames tell nothing of."""
+        """Instances that a session did not find, though nothing tells it that they have just gone."""
 
     def match(self, session: int) -> None:
         """What one session has changed."""
@@ -102,9 +104,16 @@ class ChangeMatching:
             found = None if placed.state == "removed" else self._look_for(placed, fresh, session)
             if found is not None:
                 gone.append((placed, found))
-            elif placed.state != "present" and self._counts[placed.now] and self._well_seen(placed.now, session):
+            elif self._may_be_elsewhere(placed, session):
                 self._elsewhere.append(placed)
         return gone
+
+    def _may_be_elsewhere(self, placed: PlacedInstance, session: int) -> bool:
+        """Return whether an instance was told to be gone, or is near frames that tell nothing of it."""
+        if placed.state == "removed":
+            return placed.places[0] in self._told_gone
+        near = placed.state == "unseen" and not self._p.out_of_sight(placed.now, session)
+        return near and self._counts[placed.now] and self._well_seen(placed.now, session)
 
     def _look_for(self, placed: PlacedInstance, fresh: Sequence[int], session: int) -> PlaceVisibility | None:
         """Return what frames tell about the place of an instance that was not found again, if it is gone from there."""
@@ -218,6 +227,7 @@ class ChangeMatching:
 
     def _remove(self, placed: PlacedInstance, session: int, found: PlaceVisibility) -> None:
         placed.state = "removed"
+        self._told_gone.add(placed.places[0])
         box = self._p.box(placed.now, session, before=True)
         reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be judged)"
         self._record(

@@ -57,12 +57,13 @@ def _state(events: list[ChangeEvent], seen: set[int], session_id: int, latest: i
 
 
 def _where(instance: Instance, events: list[ChangeEvent], session_id: int) -> Instance:
-    """Return the instance where it was before the first move after the session."""
-    moves = [e for e in events if e.session_id > session_id and e.kind == "moved" and e.from_box is not None]
-    if not moves:
+    """Return the instance where it was before it first went after the session, or where it had been if it was gone."""
+    later = [e for e in events if e.session_id > session_id and e.kind in ("moved", "removed")]
+    known = [e for e in events if e.session_id <= session_id]
+    gone = known[-1:] if known and known[-1].kind == "removed" else []
+    box = next((e.from_box for e in (*gone, *later)), None)
+    if box is None:
         return instance
-    box = moves[0].from_box
-    assert box is not None
     corners = box.corners()
     aabb = np.stack([corners.min(axis=0), corners.max(axis=0)])
     return replace(instance, center=box.center, aabb=aabb, box=box)
