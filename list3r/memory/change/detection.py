@@ -5,8 +5,9 @@ surface of the other. An instance of an earlier session that the new one did not
 session's frames: only where they see through its place, or measure there the surface of something new, is it gone, and
 what no frame could see stays unseen. What is new is asked about in the frames of the sessions before in the same way.
 What is gone from one place and new at another is one instance that moved if it looks and measures the same, one to one,
-the best pairs first decided together. An instance that moved keeps what earlier sessions saw of it, but its box is
-that of the place where it is now.
+decided for all of them together. So is what an earlier session found gone and, less likely, what the frames tell
+nothing of although they come near, where earlier frames see through the new place. An instance that moved keeps what
+earlier sessions saw of it, but its box is that of the place where it is now.
 """
 
 from __future__ import annotations

@@ -109,11 +109,10 @@ class ChangeMatching:
         return gone
 
     def _may_be_elsewhere(self, placed: PlacedInstance, session: int) -> bool:
-        """Return whether an instance was told to be gone, or is near frames that tell nothing of it."""
+        """Return whether an instance was told to be gone, or nothing is told of it."""
         if placed.state == "removed":
             return placed.places[0] in self._told_gone
-        near = placed.state == "unseen" and not self._p.out_of_sight(placed.now, session)
-        return near and self._counts[placed.now] and self._well_seen(placed.now, session)
+        return placed.state == "unseen" and self._counts[placed.now] and self._well_seen(placed.now, session)
 
     def _look_for(self, placed: PlacedInstance, fresh: Sequence[int], session: int) -> PlaceVisibility | None:
         """Return what frames tell about the place of an instance that was not found again, if it is gone from there."""

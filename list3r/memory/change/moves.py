@@ -78,35 +78,37 @@ class MoveSearch:
         """
         from scipy.optimize import linear_sum_assignment
 
-        missing = [m for m in missing if any(self._may_be(m, n, came) for n in fresh)]
+        missing = [m for m in missing if any(self._may_be(m, n, came, session) for n in fresh)]
         if not missing or not fresh:
             return []
         p, s = self._p, self._s
         cost = np.full((len(missing), len(fresh)), _NEVER)
+        against = [-2.0 * float(np.log(s.left_unseen)) if m.hidden else 0.0 for m in missing]
         new = [p.looks(n, session, before=False, stayed=n in stayed) for n in fresh]
         for i, m in enumerate(missing):
             old = p.looks(m.placed.now, session, before=True, stayed=m.placed.now in stayed)
-            less_likely = -2.0 * np.log(s.left_unseen) if m.hidden else 0.0
             for j, n in enumerate(fresh):
-                if self._may_be(m, n, came):
-                    found = difference(old, new[j], s, p.unit) + less_likely
+                if self._may_be(m, n, came, session):
+                    found = difference(old, new[j], s, p.unit) + against[i]
                     cost[i, j] = found if found <= s.most_deviations else _NEVER
         # For every instance that is missing there is one more column: that it was not found, at the price of the limit.
         rest = np.full((len(missing), len(missing)), _NEVER)
         np.fill_diagonal(rest, s.most_deviations)
         rows, columns = linear_sum_assignment(np.hstack([cost, rest]))
         return [
-            Move(missing[i], fresh[j], float(cost[i, j]), _chance(cost, i, j, s.most_deviations))
+            Move(missing[i], fresh[j], float(cost[i, j]) - against[i], _chance(cost, i, j, s.most_deviations))
             for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
             if j < len(fresh) and cost[i, j] < _NEVER
         ]
 
-    def _may_be(self, missing: Missing, n: int, came: Collection[int]) -> bool:
-        """Return whether something new can be what is missing: no session saw both, and no edit tells them apart."""
+    def _may_be(self, missing: Missing, n: int, came: Collection[int], session: int) -> bool:
+        """Return whether something new can be what is missing: no session saw both, no edit tells them apart, and frames
+        came near where nothing tells.
+        """
         p, placed = self._p, missing.placed
         if p.component[n] != p.component[placed.now] or (missing.gone is None and n not in came):
             return False
-        if missing.hidden and p.plainly_other(placed.now, n):
+        if missing.hidden and (p.plainly_other(placed.now, n) or p.out_of_sight(placed.now, session)):
             return False
         if any(not set(p.sessions[n]).isdisjoint(p.sessions[m]) for m in placed.places):
             return False
