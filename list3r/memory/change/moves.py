@@ -102,8 +102,8 @@ class MoveSearch:
         ]
 
     def _may_be(self, missing: Missing, n: int, came: Collection[int], session: int) -> bool:
-        """Return whether something new can be what is missing: no session saw both, no edit tells them apart, and, where
-        nothing tells that it is gone, frames came near.
+        """Return whether something new can be what is missing: no session saw both, no edit tells them apart, and,
+        where nothing tells that it is gone, frames came near.
         """
         p, placed = self._p, missing.placed
         if p.component[n] != p.component[placed.now] or (missing.gone is None and n not in came):
