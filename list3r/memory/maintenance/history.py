@@ -15,7 +15,7 @@ _STATES = {"seen_again": "present", "moved": "moved", "removed": "removed", "add
 def world_at(store: Store, session_id: int) -> list[Instance]:
     """Return the instances known after a session, by id, where they were then and in the state that they had then.
 
-    What was seen only later is left out; an instance that was moved later is where it was before. Sizes and words are
+    What was seen only later is left out; an instance that went later is where it was before. Sizes and words are
     those of today, which rest on all that was ever seen of an instance. Raises `OptionError` for a session that there
     is not.
     """
