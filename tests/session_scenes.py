@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -43,6 +44,15 @@ ROOM: Mapping[str, Box] = {
     "green": Box((0.05, -0.15, 0.82), (0.12, 0.16, 0.16), (30, 170, 40)),
     "stool": Box((0.0, 2.6, 0.2), (0.35, 0.35, 0.4), (230, 220, 60)),
 }
+
+
+def metric_store(path: Path) -> Store:
+    """A new memory in metres, with gravity known."""
+    store = Store.create(path)
+    with store.transaction():
+        store.facts.scale_kind = "metric"
+        store.facts.gravity = "known"
+    return store
 
 
 def cameras(target: tuple[float, float, float], start: float, turn: float = 1.6) -> Array:

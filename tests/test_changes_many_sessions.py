@@ -12,7 +12,7 @@ import pytest
 from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import ChangeEvent
 from list3r.memory.store.store import Store
-from tests.session_scenes import Box
+from tests.session_scenes import Box, metric_store
 from tests.test_growth_sessions import APART_M, film, house, moved
 
 AT_FIRST, AT_SECOND, AT_STAND = [(0, 0.4), (0, 1.5)], [(1, 0.9), (1, 2.0)], [(2.6 / APART_M, 3.5)]
@@ -28,10 +28,7 @@ ON_TABLE = replace(ON_STAND, center=(-0.25, 0.32, 0.81))
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    with Store.create(tmp_path / "house.l3r") as opened:
-        with opened.transaction():
-            opened.facts.scale_kind = "metric"
-            opened.facts.gravity = "known"
+    with metric_store(tmp_path / "house.l3r") as opened:
         yield opened
 
 

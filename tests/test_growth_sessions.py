@@ -15,7 +15,7 @@ from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.maintenance import edits
 from list3r.memory.store.store import Store
-from tests.session_scenes import FRAMES, Box, cameras, simulated_chunk
+from tests.session_scenes import FRAMES, Box, cameras, metric_store, simulated_chunk
 from tests.test_growth import tables
 
 GROW = ConsolidationSettings(whole_chunks=0, whole_share=1.0)
@@ -45,10 +45,7 @@ def moved(name: str, dx: float, dy: float) -> Box:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    with Store.create(tmp_path / "house.l3r") as opened:
-        with opened.transaction():
-            opened.facts.scale_kind = "metric"
-            opened.facts.gravity = "known"
+    with metric_store(tmp_path / "house.l3r") as opened:
         yield opened
 
 

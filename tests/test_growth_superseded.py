@@ -15,7 +15,7 @@ from list3r.memory.library.rules import ConsolidationSettings, RedundancySetting
 from list3r.memory.maintenance import edits
 from list3r.memory.records import Votes
 from list3r.memory.store.store import Store
-from tests.session_scenes import FRAMES, Box, cameras, simulated_chunk
+from tests.session_scenes import FRAMES, Box, cameras, metric_store, simulated_chunk
 from tests.test_growth_sessions import APART_M, house, moved
 
 EVERY = ConsolidationSettings(whole_chunks=0, whole_share=1.0, redundancy=RedundancySettings(sessions=0))
@@ -33,11 +33,7 @@ ROOMS = [
 
 @pytest.fixture
 def stores(tmp_path: Path) -> Iterator[tuple[Store, Store]]:
-    with Store.create(tmp_path / "every.l3r") as every, Store.create(tmp_path / "last.l3r") as last:
-        for store in (every, last):
-            with store.transaction():
-                store.facts.scale_kind = "metric"
-                store.facts.gravity = "known"
+    with metric_store(tmp_path / "every.l3r") as every, metric_store(tmp_path / "last.l3r") as last:
         yield every, last
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.change.places import GroupLooks, difference
+from list3r.memory.change.moves import difference
+from list3r.memory.change.places import GroupLooks
 from list3r.memory.change.records import ChangeSettings
 from list3r.memory.change.surface_colors import LightBetween, hue_distance, lab, palette_distance
 from list3r.memory.library.consolidation import consolidate

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from list3r.memory.change.places import Places, difference
+from list3r.memory.change.places import GroupLooks, Places
 from list3r.memory.change.records import ChangeSettings
+from list3r.memory.change.surface_colors import hue_distance, palette_distance
 from list3r.memory.constraints import Constraints
 from list3r.memory.geometry import Array
 from list3r.memory.overlap.visibility import PlaceVisibility
@@ -113,6 +114,19 @@ class MoveSearch:
         if any(not set(p.sessions[n]).isdisjoint(p.sessions[m]) for m in placed.places):
             return False
         return not self._constraints.forbids([k for m in placed.places for k in p.groups[m]], list(p.groups[n]))
+
+
+def difference(a: GroupLooks, b: GroupLooks, s: ChangeSettings, unit: float = 1.0) -> float:
+    """Return the sum of squared deviations between two looks; infinite for two that cannot be one instance."""
+    deviation = np.array(s.side_share) * (a.extent + b.extent) / 2 + np.array(s.side_m) * unit
+    sides = (a.extent - b.extent) / deviation
+    off = sides[np.abs(sides) > s.side_longer]
+    if len(off) and (off > 0).all() != (off > 0).any():  # neither is a part of the other
+        return float("inf")
+    sides = np.minimum(sides**2, s.side_most)
+    color = (palette_distance(a.palette, b.palette) / s.palette) ** 2 + hue_distance(a.palette, b.palette) / s.hues
+    total = float(sides.sum()) + color
+    return total if total <= s.most_deviations else float("inf")
 
 
 def _chance(cost: Array, i: int, j: int, none: float) -> float:

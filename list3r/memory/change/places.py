@@ -16,10 +16,8 @@ from list3r.memory.change.surface_colors import (
     Colors,
     LightBetween,
     color_distance,
-    hue_distance,
     lab,
     meeting,
-    palette_distance,
 )
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
@@ -52,19 +50,6 @@ class GroupLooks:
     """Larger and smaller side of the footprint, height; world units, upright where gravity is known. Shape (3,)."""
     palette: Array
     """Colours of its surface, CIE L*a*b*, lightness at half weight, in the light of the later session. Shape (N, 3)."""
-
-
-def difference(a: GroupLooks, b: GroupLooks, s: ChangeSettings, unit: float = 1.0) -> float:
-    """Return the sum of squared deviations between two looks; infinite for two that cannot be one instance."""
-    deviation = np.array(s.side_share) * (a.extent + b.extent) / 2 + np.array(s.side_m) * unit
-    sides = (a.extent - b.extent) / deviation
-    off = sides[np.abs(sides) > s.side_longer]
-    if len(off) and (off > 0).all() != (off > 0).any():  # neither is a part of the other
-        return float("inf")
-    sides = np.minimum(sides**2, s.side_most)
-    color = (palette_distance(a.palette, b.palette) / s.palette) ** 2 + hue_distance(a.palette, b.palette) / s.hues
-    total = float(sides.sum()) + color
-    return total if total <= s.most_deviations else float("inf")
 
 
 class Places:
@@ -261,10 +246,11 @@ class Places:
 
         `before` a session that does not show it there any more, in all earlier ones, else in the first that does.
         """
-        keys = self.members(n, session, before=before, stayed=stayed)
         if before:
             keys = [k for k in self.groups[n] if self.rows[k[0]].session_id < session]
             keys = keys if stayed else self._pure(n, keys, session, before=True)
+        else:
+            keys = self.members(n, session, before=False, stayed=stayed)
         weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
         views = [] if stayed else self._views_across(n, session, before=before)
         rgb = [self._colors_of(key)[self._changed_rows(self._points_of(key), views)] for key in keys]
