@@ -137,7 +137,7 @@ def _aabb(origin: Instance | None, place: NDArray[np.float64] | None) -> NDArray
     if origin is not None:
         return origin.aabb
     assert place is not None
-    return np.stack([place, place])
+    return np.array([place, place])
 
 
 def _measure(store: Store, origin: Instance | None, place: NDArray[np.float64] | None) -> Callable[[Instance], float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +61,8 @@ def nearest_first(store: Store, aabb: NDArray[np.float64], search: NearestSearch
     bounds = store.instances.bounds()
     if bounds is None:
         return []
-    touch = search.touch + STRAY * float(np.linalg.norm(bounds[1] - bounds[0]))
-    whole = float(np.linalg.norm(np.maximum(np.abs(bounds - aabb[0]), np.abs(bounds - aabb[1])).max(axis=0))) + 1.0
+    touch = search.touch + STRAY * math.dist(*bounds.tolist())
+    whole = _farthest(bounds, aabb) + 1.0
     farthest = whole if limit is None else min(limit + touch, whole)
     kept = store.derived.of(UsualReach)
     usual = kept.reach
@@ -83,7 +84,7 @@ def nearest_first(store: Store, aabb: NDArray[np.float64], search: NearestSearch
             reach, shrinking = 0.5 * reach, shrinking - 1
             continue
         shrinking = 0
-        best = _measure(store, ids, box_gaps(boxes, aabb), replace(search, touch=touch), measured)
+        best = _measure(store, ids, box_gaps(boxes, aabb), search, touch + _ROUNDING, measured)
         worst = best[k - 1][0] + touch if len(best) >= k else np.inf
         if worst <= reach or reach >= farthest:
             if len(best) >= k:
@@ -97,10 +98,13 @@ def _measure(
     ids: NDArray[np.int64],
     gaps: NDArray[np.float64],
     search: NearestSearch,
+    farther: float,
     measured: dict[int, tuple[float, Instance] | None],
 ) -> list[tuple[float, Instance]]:
-    """Measure whatever could be among the k nearest. Returns the best so far, in order."""
-    k, farther = search.k, search.touch + _ROUNDING
+    """Measure whatever could be among the k nearest. Returns the best so far, in order. A distance may be smaller than
+    the gap between boxes, but not by more than `farther`.
+    """
+    k = search.k
     best = sorted((m for m in measured.values() if m is not None), key=lambda m: (m[0], m[1].id))[:k]
     order = np.lexsort((ids, gaps))
     start, width = 0, k + 2
@@ -127,6 +131,12 @@ def box_gaps(boxes: NDArray[np.float64], aabb: NDArray[np.float64]) -> NDArray[n
     """Return the distances of boxes (N, 2, 3) from a box (2, 3), 0 where they meet. Shape (N,)."""
     apart = np.maximum(0.0, np.maximum(boxes[:, 0] - aabb[1], aabb[0] - boxes[:, 1]))
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
+
+
+def _farthest(bounds: NDArray[np.float64], aabb: NDArray[np.float64]) -> float:
+    """Return a distance that no point of a box (2, 3) exceeds from any of another. In floats: it is asked each time."""
+    (a, b), (c, d) = bounds.tolist(), aabb.tolist()
+    return math.hypot(*(max(high - z, w - low) for low, high, z, w in zip(a, b, c, d, strict=True)))
 
 
 def _spacing(store: Store, bounds: NDArray[np.float64], k: int) -> float:

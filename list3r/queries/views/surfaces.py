@@ -127,11 +127,13 @@ def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float6
     if surface.support is not None:
         offset = surface.support - point
         return float(np.sqrt(np.min(np.einsum("ij,ij->i", offset, offset))))
-    box = instance.box
-    outside = (np.abs((point - box.center) @ box.rotation) - box.size / 2.0).tolist()
+    at, box = point.tolist(), instance.box
+    along = zip(np.dot(point - box.center, box.rotation).tolist(), box.size.tolist(), strict=True)
+    outside = [abs(offset) - 0.5 * edge for offset, edge in along]
     if max(outside) <= 0.0:
         return float(-max(outside))
-    apart = np.maximum(instance.aabb[0] - point, point - instance.aabb[1]).tolist()
+    low, high = instance.aabb.tolist()
+    apart = [max(a - x, x - b) for a, x, b in zip(low, at, high, strict=True)]
     return math.sqrt(max(_squared(*outside), _squared(*apart)))
 
 
