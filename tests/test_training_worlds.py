@@ -180,6 +180,21 @@ def test_what_is_built_in_stands_in_the_room_and_structure_is_none_of_it() -> No
     assert make_world(2).things[6:] != worlds[0].things[6:]
 
 
+@pytest.mark.parametrize("seed", [12, 13])
+def test_what_closes_an_opening_lies_behind_the_face_of_its_wall_and_leaves_no_hole(seed: int) -> None:
+    world = make_world(seed, recessed=True)
+    behind = []
+    for thing in world.things:
+        floor = thing.vertices()[:, :2]
+        beyond = max(float(-floor.min()), float((floor - world.size[:2]).max()))
+        behind += [thing.label] if beyond > 0.03 and not thing.structure else []
+        assert beyond < 0.6
+    assert set(behind) & {"window", "door", "shelf", "wardrobe"}
+    assert [t.id for t in world.things] == [*range(1, len(world.things) + 1)]
+    film = make_film(FilmSettings(seed, recessed=True, frames=4))
+    assert (film.ids > 0).mean() > 0.999
+
+
 def test_a_labelled_scan_of_others_is_filmed_with_its_truth(tmp_path: Path) -> None:
     from training.worlds.gazebo import film_house
 

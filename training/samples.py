@@ -76,20 +76,29 @@ def sample_of(film: Film, seed: int, every: int = 1, reconstruction: Reconstruct
     return Sample(seed, film.sensor, shown, ids, poses, film.things, up, reconstruction.depth_noise is not None)
 
 
-def make_sample(seed: int, folder: Path, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0) -> Path:
+def make_sample(
+    seed: int,
+    folder: Path,
+    *,
+    held_out: bool = False,
+    fitted: bool = False,
+    odd: float = 0.0,
+    recessed: bool = False,
+) -> Path:
     """Make the chunk of a seed and write it, unless it is there already; return its file."""
-    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd)
+    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd, recessed=recessed)
     if not path.exists():
-        settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd)
+        settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd, recessed=recessed)
         settings = settings if held_out else varied(settings)
         sample = sample_of(make_film(settings), seed, settings.every)
         write_sample(path, sample)
     return path
 
 
-def chunk_file(seed: int, folder: Path, *, held_out: bool, fitted: bool, odd: float) -> Path:
+def chunk_file(seed: int, folder: Path, *, held_out: bool, fitted: bool, odd: float, recessed: bool = False) -> Path:
     """Return the file of the chunk of a seed."""
-    kind = f"{'test' if held_out else 'train'}-{'fitted-' if fitted else ''}{'odd-' if odd else ''}"
+    kinds = (("fitted-", fitted), ("odd-", odd), ("recessed-", recessed))
+    kind = f"{'test' if held_out else 'train'}-{''.join(name for name, wanted in kinds if wanted)}"
     return folder / f"{kind}{seed:06d}.npz"
 
 

@@ -63,6 +63,8 @@ class FilmSettings:
     """Rooms with what is built in, see `make_world`."""
     odd: float = 0.0
     """Share of things that no catalogue knows, see `make_world`."""
+    recessed: bool = False
+    """Rooms whose windows, doors and niches lie behind the face of the walls, see `make_world`."""
     frames: int = 30
     every: int = 2
     """Only every n-th frame of the walk is filmed, which is all that fusion looks at."""
@@ -99,7 +101,13 @@ class Visit:
 def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
     """Return the walk of a seed through the world of that seed."""
     visit = visit or Visit()
-    world = make_world(settings.seed, held_out=settings.held_out, fitted=settings.fitted, odd=settings.odd)
+    world = make_world(
+        settings.seed,
+        held_out=settings.held_out,
+        fitted=settings.fitted,
+        odd=settings.odd,
+        recessed=settings.recessed,
+    )
     rng = np.random.default_rng([settings.seed, 7])
     sensor = drawn_sensor(settings, rng)
     focal = settings.size[0] * rng.uniform(0.72, 0.9)

@@ -82,6 +82,12 @@ def sliding_door(d: Draft, width: float | None = None, height: float | None = No
     d.add(box((w + 0.12, 0.12, 0.06), (0, 0.06, h)), frame)
 
 
+def plain_door(d: Draft, width: float, height: float) -> None:
+    """A leaf without a frame, with a handle."""
+    d.add(box((width, 0.04, height), (0, 0.02, 0)), d.palette.paint() if d.rng.random() < 0.6 else d.palette.wood())
+    d.add(box((0.12, 0.05, 0.02), (width / 2 - 0.12, 0.06, 1.0)), d.palette.metal())
+
+
 def panel(d: Draft) -> None:
     """A board before a wall: boarding, an upholstered headboard, a sound absorber; its origin is at the wall."""
     w, h, t = d.u(0.5, 2.6), d.u(0.4, 2.2), d.u(0.012, 0.07)

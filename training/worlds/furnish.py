@@ -9,12 +9,19 @@ from numpy.typing import NDArray
 
 from training.worlds.catalogue import KINDS, ODD, Kind, kinds_at
 from training.worlds.draft import Draft
-from training.worlds.fitted import built_in_wardrobe, folding_door, large_window, shelf_wall, sliding_door
-from training.worlds.materials import Palette
+from training.worlds.fitted import (
+    built_in_wardrobe,
+    folding_door,
+    large_window,
+    plain_door,
+    shelf_wall,
+    sliding_door,
+)
+from training.worlds.materials import Material, Palette
 from training.worlds.mesh import box
 from training.worlds.room import Placed, Room, flat_pose, room_shell
 from training.worlds.settle import fill_zone
-from training.worlds.structural import Niche, build_structure
+from training.worlds.structural import Niche, Opening, build_structure, free_opening, open_walls, wall_behind
 
 
 @dataclass(frozen=True)
@@ -26,11 +33,14 @@ class World:
     room: Room
 
 
-def make_world(seed: int, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0) -> World:
+def make_world(
+    seed: int, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0, recessed: bool = False
+) -> World:
     """Return the furnished room of a seed; with `held_out` families and textures appear that training never shows.
 
     `fitted` rooms have structure that looks like things, and things that are built in. `odd` is the share of oddments;
-    rooms with them may be larger, and things stand on their tops in rows, too.
+    rooms with them may be larger, and things stand on their tops in rows, too. In `recessed` rooms windows, doors and
+    niches lie behind the face of the walls.
     """
     rng = np.random.default_rng([seed, 1 if held_out else 0])
     most = 7.5 if odd else 6.5 if fitted else 5.5
@@ -39,6 +49,8 @@ def make_world(seed: int, *, held_out: bool = False, fitted: bool = False, odd: 
     room = Room(size, rng)
     painter = _Furnisher(room, palette, held_out, odd)
     painter.shell()
+    if recessed:
+        painter.recesses()
     if fitted:
         painter.built_in()
     painter.openings()
@@ -49,6 +61,11 @@ def make_world(seed: int, *, held_out: bool = False, fitted: bool = False, odd: 
     painter.floor_things()
     painter.clutter()
     return World(size, tuple(room.things), room)
+
+
+_CLOSED_BY = ("large window", "large window", "large window", "wide", "door", "shelf", "bare")
+"""What openings of walls are closed by; "wide" is a window as wide as the wall, "bare" a niche."""
+_LEAVES = {"sliding door": sliding_door, "folding door": folding_door, "door": plain_door}
 
 
 class _Furnisher:
@@ -99,6 +116,38 @@ class _Furnisher:
             for number in range(4):
                 along, across = (x, sx) if number % 2 == 0 else (y, sy)
                 self.room.wall_free(number, (along - across / 2, along + across / 2), (0, h), take=True)
+
+    def recesses(self) -> None:
+        """Cut openings into the walls, and close them with windows, doors, shelves, wardrobes or bare wall."""
+        wall, cut = self.room.things[2].parts[0][1], []
+        for _ in range(int(self.rng.integers(2, 6))):
+            name = str(self.rng.choice(_CLOSED_BY))
+            opening = free_opening(self.room, name)
+            if opening is not None:
+                cut.append(opening)
+                self._close(name, opening, wall)
+        open_walls(self.room, cut)
+
+    def _close(self, name: str, o: Opening, wall: Material) -> None:
+        """Put what closes an opening behind the face of its wall."""
+        w, h = o.width, o.top - o.low
+        draft, kind = Draft(self.rng, self.palette), None
+        if name == "shelf":
+            kind = "built-in wardrobe" if o.low == 0.0 and self.rng.random() < 0.5 else "shelf wall"
+            {"built-in wardrobe": built_in_wardrobe, "shelf wall": shelf_wall}[kind](draft, w, h, o.depth)
+        elif name != "bare":
+            kind = str(self.rng.choice(list(_LEAVES))) if name == "door" else "large window"
+            {**_LEAVES, "large window": large_window}[kind](draft, w, h)
+        if name in ("bare", "shelf"):
+            wall_behind(self.room, o, wall)
+        if kind is not None:
+            away = -o.depth / 2 if name == "shelf" else -o.depth
+            self._place(KINDS[kind], draft, self.room.wall_pose(o.wall, o.along, away, o.low), mark=False)
+        if name in ("large window", "wide") and self.rng.random() < 0.4:
+            self._hang(KINDS["radiator"], 0.0, o.wall, o.along)
+        for side in (-1, 1) if name == "large window" else ():
+            if self.rng.random() < 0.3:
+                self._hang(KINDS["curtain"], 0.03, o.wall, o.along + side * (w / 2 + 0.3))
 
     def built_in(self) -> None:
         """Build structure into the room, and what is made for its niches and walls."""

@@ -1,8 +1,9 @@
-"""Structure that looks like things: pillars, niches, ledges, beams, steps, half walls."""
+"""Structure that looks like things: pillars, niches, ledges, beams, steps, half walls, walls with openings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,82 @@ class Niche:
     height: float
     depth: float
     """From its back to the wall's new front."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A rectangle cut out of a wall, seen from the room."""
+
+    wall: int
+    along: float
+    """Middle along the wall, metres."""
+    width: float
+    low: float
+    """Height of its lower edge, metres."""
+    top: float
+    depth: float
+    """How far back what closes it lies behind the face of the wall, metres."""
+
+
+def free_opening(room: Room, name: str) -> Opening | None:
+    """Return a bare rectangle of a wall for a window or niche, a "door", a "shelf" or a "wide" window, and take it."""
+    rng, high = room.rng, room.size[2]
+    number = int(rng.integers(4))
+    length = room.wall_length(number)
+    width = float(rng.uniform(0.5, 2.4))
+    low, top = float(rng.uniform(0.25, 1.1)), float(rng.uniform(1.7, high - 0.1))
+    if name == "door" or (name == "shelf" and rng.random() < 0.5):
+        low, top = 0.0, float(rng.uniform(1.95, min(2.4, high - 0.05)))
+        width = float(rng.uniform(0.75, 2.2))
+    if name == "wide":
+        low, width = float(rng.uniform(0.0, 1.0)), length - float(rng.uniform(0.05, 0.8))
+        top = high - float(rng.uniform(0.03, 0.4))
+    if width > length - 0.04:
+        return None
+    along = float(rng.uniform(width / 2 + 0.02, length - width / 2 - 0.02))
+    span = along - width / 2, along + width / 2
+    if not room.wall_free(number, span, (0.0, high)):
+        return None
+    room.wall_free(number, span, (low, top), take=True)
+    depth = rng.uniform(0.15, 0.5) if name == "shelf" else rng.uniform(0.03, 0.4) ** 1.3
+    return Opening(number, along, width, low, top, float(depth))
+
+
+def wall_behind(room: Room, opening: Opening, material: Material) -> None:
+    """Close an opening with wall."""
+    mesh = box((opening.width, 0.1, opening.top - opening.low))
+    pose = room.wall_pose(opening.wall, opening.along, -opening.depth - 0.05, opening.low)
+    room.things.append(
+        Placed(len(room.things) + 1, "wall", "wall", "structure", ((mesh, material),), pose, structure=True)
+    )
+
+
+def open_walls(room: Room, openings: Sequence[Opening]) -> None:
+    """Cut openings, apart from each other along each wall, out of the walls of an empty room."""
+    high = room.size[2]
+    for number in sorted({o.wall for o in openings}):
+        here = sorted((o for o in openings if o.wall == number), key=lambda o: o.along)
+        thick, edge = max(o.depth for o in here), 0.0
+        pieces = []
+        for o in here:
+            low, upper = o.along - o.width / 2, o.along + o.width / 2
+            pieces += [(edge, low, 0.0, high), (low, upper, 0.0, o.low), (low, upper, o.top, high)]
+            edge = upper
+        pieces.append((edge, room.wall_length(number), 0.0, high))
+        whole = room.things[_FIRST_WALL + number]
+        for a, b, z, end in pieces:
+            if b - a < 1e-6 or end - z < 1e-6:
+                continue
+            pose = room.wall_pose(number, (a + b) / 2, -thick / 2, z)
+            part = replace(whole, parts=((box((b - a, thick, end - z)), whole.parts[0][1]),), T_world_thing=pose)
+            if room.things[_FIRST_WALL + number] is whole:
+                room.things[_FIRST_WALL + number] = part
+            else:
+                room.things.append(replace(part, id=len(room.things) + 1))
+
+
+_FIRST_WALL = 2
+"""Place of the first wall among the things of a room, after floor and ceiling."""
 
 
 def build_structure(room: Room, palette: Palette, wall: Material) -> list[Niche]:
