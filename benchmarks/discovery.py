@@ -58,6 +58,7 @@ def main() -> None:
     parser.add_argument("--methods", default="learned,true", help="of learned, true")
     parser.add_argument("--sensor", help="structured, tof, lidar or computed; without it each world draws one")
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
+    parser.add_argument("--recessed", action="store_true", help="windows and doors behind the walls; a third built in")
     parser.add_argument("--house", type=Path, help="folder of a Gazebo world, or a labelled scan (PCD); walks there")
     parser.add_argument("--colour", choices=("grey", "none"), help="pictures without hue, or without anything to see")
     parser.add_argument("--swept", action="store_true", help="depth that the plane sweep computes from the pictures")
@@ -69,7 +70,7 @@ def main() -> None:
     weights = {"learned": args.weights} | {n: Path(f) for n, _, f in (text.partition("=") for text in args.also)}
     methods = [*filter(None, args.methods.split(",")), *(n for n in weights if n != "learned")]
     for seed in seeds_of(args.seeds):
-        film = film_of(seed, args.sensor, args.house, fitted=args.fitted)
+        film = film_of(seed, args.sensor, args.house, fitted=args.fitted, recessed=args.recessed)
         if args.colour:
             film = replace(film[0], color=without_colour(film[0].color, args.colour)), film[1]
         reconstruction = swept(film[0], seed) if args.swept else reconstruction_of(film[0], seed=seed)
@@ -87,7 +88,8 @@ def main() -> None:
     print(machine())
     for method, entry in table.items():
         print(method, json.dumps(entry))
-    source = "house" if args.house else "fitted worlds" if args.fitted else "worlds"
+    kind = "recessed worlds" if args.recessed else "worlds"
+    source = "house" if args.house else f"fitted {kind}" if args.fitted else kind
     source += f", colour: {args.colour}" if args.colour else ""
     source += ", depth by plane sweep" if args.swept else ""
     write_json(args.json, {"source": source, "least_px": MIN_PX, "mean": table, "walks": rows})
@@ -102,13 +104,16 @@ def seeds_of(text: str) -> list[int]:
     return out
 
 
-def film_of(seed: int, sensor: str | None, house: Path | None, *, fitted: bool = False) -> tuple[Film, int]:
+def film_of(
+    seed: int, sensor: str | None, house: Path | None, *, fitted: bool = False, recessed: bool = False
+) -> tuple[Film, int]:
     """A walk, and of how many frames one is filmed."""
     if house is not None:
         from training.worlds.gazebo import film_house
 
         return film_house(house, seed, sensor or ("structured", "lidar", "tof")[seed % 3]), 2
-    settings = FilmSettings(seed, held_out=True, sensor=sensor, fitted=fitted)
+    built_in = fitted or (recessed and seed % 3 == 2)
+    settings = FilmSettings(seed, held_out=True, sensor=sensor, fitted=built_in, recessed=recessed)
     return make_film(settings), settings.every
 
 
