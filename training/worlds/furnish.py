@@ -21,7 +21,15 @@ from training.worlds.materials import Material, Palette
 from training.worlds.mesh import box
 from training.worlds.room import Placed, Room, flat_pose, room_shell
 from training.worlds.settle import fill_zone
-from training.worlds.structural import Niche, Opening, build_structure, free_opening, open_walls, wall_behind
+from training.worlds.structural import (
+    FIRST_WALL,
+    Niche,
+    Opening,
+    build_structure,
+    free_opening,
+    open_walls,
+    wall_behind,
+)
 
 
 @dataclass(frozen=True)
@@ -119,7 +127,7 @@ class _Furnisher:
 
     def recesses(self) -> None:
         """Cut openings into the walls, and close them with windows, doors, shelves, wardrobes or bare wall."""
-        wall, cut = self.room.things[2].parts[0][1], []
+        wall, cut = self.room.things[FIRST_WALL].parts[0][1], []
         for _ in range(int(self.rng.integers(2, 6))):
             name = str(self.rng.choice(_CLOSED_BY))
             opening = free_opening(self.room, name)

@@ -13,6 +13,9 @@ from training.worlds.materials import Material, Palette
 from training.worlds.mesh import Mesh, box, cylinder
 from training.worlds.room import Placed, Room, flat_pose
 
+FIRST_WALL = 2
+"""Place of the first wall among the things of a room, after floor and ceiling."""
+
 
 @dataclass(frozen=True)
 class Niche:
@@ -76,7 +79,7 @@ def wall_behind(room: Room, opening: Opening, material: Material) -> None:
 
 
 def open_walls(room: Room, openings: Sequence[Opening]) -> None:
-    """Cut openings, apart from each other along each wall, out of the walls of an empty room."""
+    """Cut openings, apart from each other along each wall, out of the walls of a room."""
     high = room.size[2]
     for number in sorted({o.wall for o in openings}):
         here = sorted((o for o in openings if o.wall == number), key=lambda o: o.along)
@@ -87,20 +90,16 @@ def open_walls(room: Room, openings: Sequence[Opening]) -> None:
             pieces += [(edge, low, 0.0, high), (low, upper, 0.0, o.low), (low, upper, o.top, high)]
             edge = upper
         pieces.append((edge, room.wall_length(number), 0.0, high))
-        whole = room.things[_FIRST_WALL + number]
+        whole = room.things[FIRST_WALL + number]
         for a, b, z, end in pieces:
             if b - a < 1e-6 or end - z < 1e-6:
                 continue
             pose = room.wall_pose(number, (a + b) / 2, -thick / 2, z)
             part = replace(whole, parts=((box((b - a, thick, end - z)), whole.parts[0][1]),), T_world_thing=pose)
-            if room.things[_FIRST_WALL + number] is whole:
-                room.things[_FIRST_WALL + number] = part
+            if room.things[FIRST_WALL + number] is whole:
+                room.things[FIRST_WALL + number] = part
             else:
                 room.things.append(replace(part, id=len(room.things) + 1))
-
-
-_FIRST_WALL = 2
-"""Place of the first wall among the things of a room, after floor and ceiling."""
 
 
 def build_structure(room: Room, palette: Palette, wall: Material) -> list[Niche]:
