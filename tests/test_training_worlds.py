@@ -187,9 +187,9 @@ def test_what_closes_an_opening_lies_behind_the_face_of_its_wall_and_leaves_no_h
     for thing in world.things:
         floor = thing.vertices()[:, :2]
         beyond = max(float(-floor.min()), float((floor - world.size[:2]).max()))
-        behind += [thing.label] if beyond > 0.03 and not thing.structure else []
+        behind += [thing.label] if beyond > 0.1 else []
         assert beyond < 0.6
-    assert set(behind) & {"window", "door", "shelf", "wardrobe"}
+    assert "window" in behind  # those that are hung before a wall reach 0.06 m behind its face at most
     assert [t.id for t in world.things] == [*range(1, len(world.things) + 1)]
     film = make_film(FilmSettings(seed, recessed=True, frames=4))
     assert (film.ids > 0).mean() > 0.999
