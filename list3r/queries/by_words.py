@@ -54,7 +54,7 @@ def only_common(store: Store, words: str) -> bool:
     """Tell whether the words only name, and so many have them that it is better to look around than at all of them."""
     if _says_more_than_names(words):
         return False
-    return len(store.words.bearing(wanted_words(words), _LOADED + 1)) > _LOADED
+    return len(store.words.bearing(wanted_words(words), _LOADED + 1)[0]) > _LOADED
 
 
 def _with_words(store: Store, words: str, filters: Filters, notes: list[str]) -> list[Instance]:

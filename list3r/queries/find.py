@@ -81,8 +81,9 @@ def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
     if not words or any(more) or phrase.instance_id is not None or not is_large(store):
         return None
     gathered = Gathered(store)
-    total = dict(gathered.named(words))
-    ranks = store.instances.ranks(np.fromiter(total, np.int64, len(total)))
+    ids, hundredths = gathered.named(words)
+    total = dict(zip(ids.tolist(), hundredths.tolist(), strict=True))
+    ranks = store.instances.ranks(ids)
     ranks = ranks.among(~ranks.removed)
     if STRUCTURE.isdisjoint(words) and not ranks.structure.all():
         ranks = ranks.among(~ranks.structure)

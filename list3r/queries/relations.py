@@ -128,7 +128,7 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
     if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):
         wanted = set(wanted_words(what))
         if is_large(store):
-            found = [n for n, _ in store.words.bearing(sorted(wanted), _MOST_NAMED + 1)]
+            found = store.words.bearing(sorted(wanted), _MOST_NAMED + 1)[0].tolist()
             if len(found) > _MOST_NAMED:
                 notes.append(f"more than {_MOST_NAMED} instances match {what!r}; {_MOST_NAMED} of them were considered")
             found = sorted(found[:_MOST_NAMED])

@@ -23,7 +23,7 @@ _BY_STRUCTURE_M = 0.4
 _MOST_OBJECTS = 40
 """Instances that others may be left of, or between: at most this many are considered."""
 _Pair = tuple[int, str, float, str]
-"""Subject, predicate, confidence, and where it is seen from, in words."""
+"""Subject, predicate, confidence, and where it is seen from or how far away it is, in words."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,12 @@ def _standing(
 ) -> list[PhraseMatch]:
     subjects = {c.instance.id: c for c in found}
     best: dict[int, PhraseMatch] = {}
-    together = _pairs_of_many(search, subjects, objects, predicates) if len(objects) > _MOST_OBJECTS else None
+    if set(predicates) & set(VIEWPOINT):
+        pairs = {c.instance.id: _seen_pairs(search, subjects, c.instance, predicates) for c in objects}
+    else:
+        pairs = _stored_pairs(search, subjects, objects, predicates)
     for object in objects:
-        pairs = _pairs(search, subjects, object, predicates) if together is None else together[object.instance.id]
-        for subject, predicate, confidence, via in pairs:
+        for subject, predicate, confidence, via in pairs[object.instance.id]:
             c = subjects[subject]
             score = c.score * confidence * (0.5 + 0.5 * object.score)
             if subject not in best or score > best[subject].score:
@@ -100,15 +102,13 @@ def _standing(
     return [best[n] for n in sorted(best)]
 
 
-def _pairs_of_many(
+def _stored_pairs(
     search: PhraseSearch,
     subjects: dict[int, PhraseMatch],
     objects: list[PhraseMatch],
     predicates: Sequence[str],
-) -> dict[int, list[_Pair]] | None:
-    """Return `_pairs` of many objects, in few questions to the store; None for relations that are not stored."""
-    if set(predicates) & set(VIEWPOINT):
-        return None
+) -> dict[int, list[_Pair]]:
+    """Return by object which subjects stand so to it, by the relations of the memory, in few questions to the store."""
     out: dict[int, list[_Pair]] = {c.instance.id: [] for c in objects}
     from_objects = len(objects) <= len(subjects)
     rows = search.store.relations.among(out if from_objects else subjects, predicates, as_object=from_objects)
@@ -116,36 +116,34 @@ def _pairs_of_many(
     for r in sorted(rows, key=lambda r: (r.object, order[r.predicate], -r.confidence, r.subject)):
         if r.subject in subjects and r.object in out and r.subject != r.object:
             out[r.object].append((r.subject, r.predicate, r.confidence, ""))
-    for predicate in predicates:
+    for predicate in (p for p in predicates if objects and p in VERTICAL):
         held = relations(search.store, None, predicate, objects[0].instance.id)
-        if held.state == "unknown" and predicate in VERTICAL:
+        if held.state == "unknown":
             search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
     for c in objects if "near" in predicates else []:
         if c.instance.structure is not None:
-            near = _near_structure(search, subjects, c.instance)
-            out[c.instance.id] += [p for p in near if p[0] != c.instance.id]
+            out[c.instance.id] += _near_structure(search, subjects, c.instance)
     return out
 
 
-def _pairs(
-    search: PhraseSearch, subjects: dict[int, PhraseMatch], object: PhraseMatch, predicates: Sequence[str]
+def _seen_pairs(
+    search: PhraseSearch, subjects: dict[int, PhraseMatch], o: Instance, predicates: Sequence[str]
 ) -> list[_Pair]:
-    """Return (subject, predicate, confidence, where it is seen from) of the subjects that stand so to one object."""
-    o = object.instance
-    out: list[tuple[int, str, float, str]] = []
+    """Return which subjects stand so to one object, as seen from the viewpoint."""
+    out: list[_Pair] = []
+    place = _viewpoint(search, o)
     for predicate in predicates:
-        place = _viewpoint(search, o) if predicate in VIEWPOINT else None
-        if predicate in VIEWPOINT and place is None:
+        if place is None:
             search.notes.append(f"{predicate.replace('_', ' ')} depends on the viewpoint; name one")
             continue
         held = relations(search.store, None, predicate, o.id, viewpoint=place)
-        if held.state == "unknown" and (predicate in VIEWPOINT or predicate in VERTICAL):
+        if held.state == "unknown":
             search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
-        via = f", {held.reason.split(';')[0]}" if place is not None else ""
-        out += [(r.subject, r.predicate, r.confidence, via) for r in held if r.subject in subjects]
-    if "near" in predicates and (o.structure is not None):
-        out += _near_structure(search, subjects, o)
-    return [p for p in out if p[0] != o.id]
+        via = f", {held.reason.split(';')[0]}"
+        out += [
+            (r.subject, r.predicate, r.confidence, via) for r in held if r.subject in subjects and r.subject != o.id
+        ]
+    return out
 
 
 def _near_structure(search: PhraseSearch, subjects: dict[int, PhraseMatch], o: Instance) -> list[_Pair]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
+from list3r.memory.store.tables.words import Bearers
 from list3r.queries.finding.grammar import Clause, Phrase
 from list3r.queries.match import checked_instance
 from list3r.queries.views.viewpoint import VIEWPOINT
@@ -39,7 +40,7 @@ class Gathered:
     ids: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     """What was left out."""
-    _bearing: dict[tuple[str, ...], list[tuple[int, int]]] = field(default_factory=dict)
+    _bearing: dict[tuple[str, ...], Bearers] = field(default_factory=dict)
 
     @cached_property
     def sample(self) -> list[int]:
@@ -48,29 +49,30 @@ class Gathered:
 
     def bearing(self, words: tuple[str, ...]) -> list[int]:
         """Return ids that have all of some words, the best first."""
-        return [n for n, _ in self._named(words)]
+        ids: list[int] = self._named(words)[0].tolist()
+        return ids
 
-    def named(self, words: tuple[str, ...]) -> list[tuple[int, int]]:
-        """Return the ids that are looked at of those that have all of some words, with how well these name them."""
-        found = self._named(words)
-        if len(found) > _MOST:
-            self.notes.append(f"{len(found)} instances match {' '.join(words)!r}; {_MOST} of them were considered")
-        return found[:_MOST]
+    def named(self, words: tuple[str, ...]) -> Bearers:
+        """Return the instances that are looked at of those that have all of some words, the best first."""
+        ids, hundredths = self._named(words)
+        if len(ids) > _MOST:
+            self.notes.append(f"{len(ids)} instances match {' '.join(words)!r}; {_MOST} of them were considered")
+        return ids[:_MOST], hundredths[:_MOST]
 
-    def _named(self, words: tuple[str, ...]) -> list[tuple[int, int]]:
+    def _named(self, words: tuple[str, ...]) -> Bearers:
         if words not in self._bearing:
-            found = self.store.words.bearing(words, _MOST_BEARING + 1)
-            if len(found) > _MOST_BEARING:
+            ids, hundredths = self.store.words.bearing(words, _MOST_BEARING + 1)
+            if len(ids) > _MOST_BEARING:
                 self.notes.append(f"more than {_MOST_BEARING} instances match {' '.join(words)}; add words")
-            self._bearing[words] = found[:_MOST_BEARING]
+            self._bearing[words] = ids[:_MOST_BEARING], hundredths[:_MOST_BEARING]
         return self._bearing[words]
 
     def sizes_of(self, words: tuple[str, ...]) -> NDArray[np.float64]:
         """Return longest edges of some of things that have some words, of any where fewer than four do; ascending."""
-        bearing = self.bearing(words) if words else []
-        ids = bearing[:: -(-len(bearing) // _SAMPLE)] if len(bearing) >= 4 else self.sample
-        edges = [float(np.max(i.box.size)) for i in self.store.instances.of(ids) if i.structure is None]
-        return np.sort(np.array(edges))
+        ids = self._named(words)[0] if words else np.zeros(0, np.int64)
+        ids = ids[:: -(-len(ids) // _SAMPLE)] if len(ids) >= 4 else np.array(self.sample)
+        ranks = self.store.instances.ranks(ids)
+        return np.sort(ranks.longest_edge[~ranks.structure])
 
 
 def is_large(store: Store) -> bool:
@@ -118,13 +120,11 @@ def _standing(
     if found is None and objects is None:
         _keep(out, clause.object, out.sample)
         return None
-    from_objects = objects is not None and (found is None or len(objects) <= len(found))
-    rows = store.relations.among((objects if from_objects else found) or [], clause.predicates, as_object=from_objects)
-    pairs = {(r.subject, r.object) for r in rows}
+    pairs = set(store.relations.pairs(clause.predicates, found, objects))
     if "near" in clause.predicates:
-        pairs |= _near_structure(store, objects or [])
-    subjects, others = None if found is None else set(found), None if objects is None else set(objects)
-    pairs = {(s, o) for s, o in pairs if (subjects is None or s in subjects) and (others is None or o in others)}
+        near = _near_structure(store, objects or [])
+        subjects = set(found) if near and found is not None else set()
+        pairs |= {(s, o) for s, o in near if found is None or s in subjects}
     if not pairs:
         _keep(out, clause.object, (objects or out.sample)[:_KEPT])
         return (found or out.sample)[:_KEPT]
@@ -136,7 +136,8 @@ def _standing(
 def _near_structure(store: Store, objects: Sequence[int]) -> set[tuple[int, int]]:
     """Return pairs of anything and a wall or floor among some objects, whose boxes nearly meet."""
     out = set()
-    for wall in store.instances.of(store.instances.structure_among(objects[:_MOST])[:_KEPT]):
+    ranks = store.instances.ranks(np.array(objects[:_MOST], np.int64))
+    for wall in store.instances.of(ranks.ids[ranks.structure][:_KEPT].tolist()):
         reach = 0.1 * float(np.linalg.norm(np.ptp(wall.aabb, axis=0))) + 1.0
         out |= {(n, wall.id) for n in store.instances.ids_in_box(wall.aabb[0] - reach, wall.aabb[1] + reach)[:_MOST]}
     return out

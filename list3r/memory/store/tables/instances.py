@@ -15,7 +15,7 @@ from list3r.memory.records import BestView, Instance
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import raw_array
 from list3r.memory.store.rows.columns import Columns, joined
-from list3r.memory.store.rows.table import Table, batches
+from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
@@ -25,7 +25,7 @@ from list3r.memory.store.tables.relations import RelationTable
 
 Array = NDArray[np.float64]
 _KEPT_RANKS = 500_000
-"""Instances whose ranks are kept; 9 MB."""
+"""Instances whose ranks are kept; 13 MB."""
 
 
 def _pack_geometry(center: Array, aabb: Array, box: OrientedBox) -> tuple[bytes]:
@@ -33,9 +33,14 @@ def _pack_geometry(center: Array, aabb: Array, box: OrientedBox) -> tuple[bytes]
     return (np.concatenate(parts).astype("<f8").tobytes(),)
 
 
+def _geometry(blobs: Sequence[bytes]) -> Array:
+    """What `_pack_geometry` packs. Shape (N, 24)."""
+    return raw_array(b"".join(blobs), "<f8", (len(blobs), 24), "the geometry").copy()
+
+
 def _read_geometry(blobs: Sequence[bytes]) -> list[list[Any]]:
     """Centres, axis-aligned boxes and boxes of many rows at once."""
-    g = raw_array(b"".join(blobs), "<f8", (len(blobs), 24), "the geometry").copy()
+    g = _geometry(blobs)
     boxes = map(OrientedBox, g[:, 9:12], g[:, 12:15], g[:, 15:24].reshape(-1, 3, 3))
     return [list(g[:, :3]), list(g[:, 3:9].reshape(-1, 2, 3)), list(boxes)]
 
@@ -67,7 +72,7 @@ _COLUMNS = Columns(
 
 @dataclass(frozen=True)
 class Ranks:
-    """What orders instances among those that words name equally well."""
+    """What orders instances among those that words name equally well, and tells how large they are."""
 
     ids: NDArray[np.int64]
     """Ascending. Shape (N,)."""
@@ -77,10 +82,12 @@ class Ranks:
     """Whether it is known to be gone. Shape (N,)."""
     structure: NDArray[np.bool_]
     """Shape (N,)."""
+    longest_edge: Array
+    """Of its box, world units. Shape (N,)."""
 
     def among(self, chosen: NDArray[Any]) -> Ranks:
         """Return those at some places."""
-        return Ranks(self.ids[chosen], self.confidence[chosen], self.removed[chosen], self.structure[chosen])
+        return Ranks(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     def with_more(self, other: Ranks) -> Ranks:
         """Return these and others."""
@@ -97,13 +104,14 @@ def _is_in(ids: NDArray[np.int64], known: NDArray[np.int64]) -> NDArray[np.bool_
 
 
 def _ranks(rows: Sequence[tuple[Any, ...]]) -> Ranks:
-    """Ranks of rows (id, confidence, state, structure)."""
-    ids, confidence, state, structure = zip(*rows, strict=True) if rows else ((), (), (), ())
+    """Ranks of rows (id, confidence, state, structure, geometry)."""
+    ids, confidence, state, structure, geometry = zip(*rows, strict=True) if rows else ((), (), (), (), ())
     return Ranks(
         np.array(ids, np.int64),
         np.array(confidence, np.float64),
         np.array([s == "removed" for s in state], bool),
         np.array([s is not None for s in structure], bool),
+        _geometry(geometry)[:, 12:15].max(axis=1),
     )
 
 
@@ -179,7 +187,7 @@ class Instances:
         wanted = np.sort(ids)
         fresh = wanted[~_is_in(wanted, self._ranked.ids)]
         if len(fresh):
-            rows = self._rows.columns_of(("id", "confidence", "state", "structure"), fresh.tolist())
+            rows = self._rows.columns_of(("id", "confidence", "state", "structure", "geometry"), fresh.tolist())
             self._ranked = self._ranked.with_more(_ranks(list(rows)))
         held = wanted[_is_in(wanted, self._ranked.ids)]
         return self._ranked.among(np.searchsorted(self._ranked.ids, held))
@@ -203,11 +211,6 @@ class Instances:
         """Return how many things and how many pieces of structure there are."""
         total, things = self._connection.rows("SELECT count(*), count(*) - count(structure) FROM instances")[0]
         return int(things), int(total) - int(things)
-
-    def structure_among(self, ids: Sequence[int]) -> list[int]:
-        """Return those of some instances that are structure."""
-        query = "SELECT id FROM instances WHERE id IN ({}) AND structure IS NOT NULL"
-        return [int(n) for part, marks in batches(ids) for (n,) in self._connection.rows(query.format(marks), part)]
 
     # ------------------------------------------------------------------ by place
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 
 from list3r.memory.records import Relation
@@ -47,6 +48,20 @@ class RelationTable:
         """Return the relations of some predicates in which some instances are the subject, or the object."""
         column, kinds = "object" if as_object else "subject", ",".join("?" * len(predicates))
         return self._unchecked.among(column, sorted(map(int, ids)), f"predicate IN ({kinds})", predicates)
+
+    def pairs(
+        self, predicates: Sequence[str], subjects: Iterable[int] | None, objects: Iterable[int] | None
+    ) -> list[tuple[int, int]]:
+        """Return the (subject, object) of all relations of some predicates between some instances; None is any, not
+        for both. Those of which there are fewer are looked up.
+        """
+        ends = {c: sorted(map(int, ids)) for c, ids in (("subject", subjects), ("object", objects)) if ids is not None}
+        first, *other = sorted(ends, key=lambda column: len(ends[column]))
+        among = "IN (SELECT value FROM json_each(?))"
+        where = f"{first} {among} AND predicate IN ({','.join('?' * len(predicates))})"
+        where += "".join(f" AND +{column} {among}" for column in other)
+        arguments = (json.dumps(ends[first]), *predicates, *(json.dumps(ends[column]) for column in other))
+        return self._connection.rows(f"SELECT subject, object FROM relations WHERE {where}", arguments)
 
     def drop(self, instance_id: int) -> None:
         """Forget the relations of an instance."""

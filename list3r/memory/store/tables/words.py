@@ -7,17 +7,19 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.derived import LruCache
+from list3r.memory.store.rows.columns import UNREADABLE
 from list3r.memory.store.word_index import ASK_STAMP, STAMP, expected_words, hundredths
 
 _FEW = 2_000
 """A word that so few have leads to the others; instances with more frequent ones are read whole and kept."""
 _KEPT_BYTES = 64_000_000
 """Of the bearers of frequent words that were asked for last."""
-_Bearers = tuple[NDArray[np.int64], NDArray[np.int16]]
-"""Ids, ascending, and hundredths."""
+Bearers = tuple[NDArray[np.int64], NDArray[np.int16]]
+"""Ids of instances, and how well words name them, in hundredths. Shapes (N,)."""
 
 
 class Words:
@@ -36,15 +38,15 @@ class Words:
             return wanted & {word for word, _, _ in self._expected()}
         return {word for word in wanted if self._connection.rows("SELECT 1 FROM words WHERE word = ? LIMIT 1", (word,))}
 
-    def bearing(self, words: Sequence[str], limit: int) -> list[tuple[int, int]]:
-        """Ids of the instances that have all of some words, with how well those name them together, in hundredths; the
-        best first, at most `limit`.
+    def bearing(self, words: Sequence[str], limit: int) -> Bearers:
+        """Return the instances that have all of some words, and how well those name them together; the best first, at
+        most `limit`.
         """
         wanted = sorted(set(words) - {""})
         if not wanted or wanted != sorted(set(words)):
-            return []
+            return self._bearers([])
         if not self._is_current():
-            return self._bearing_without_index(wanted)[:limit]
+            return self._bearers(self._bearing_without_index(wanted)[:limit])
         first, *others = sorted(wanted, key=lambda word: (self._count(word, _FEW + 1), word))
         if self._count(first, _FEW + 1) > _FEW:
             return self._bearing_frequent(wanted, limit)
@@ -56,18 +58,18 @@ class Words:
             f"SELECT w.instance, w.weight{weight} AS total FROM words w{joins} WHERE w.word = ?"
             " ORDER BY total DESC, w.instance LIMIT ?"
         )
-        return [(n, total) for n, total in self._connection.rows(query, (*others, first, limit))]
+        return self._bearers(self._connection.rows(query, (*others, first, limit)))
 
-    def _bearing_frequent(self, words: Sequence[str], limit: int) -> list[tuple[int, int]]:
-        (ids, total), *others = sorted((self._bearers(word) for word in words), key=lambda b: len(b[0]))
+    def _bearing_frequent(self, words: Sequence[str], limit: int) -> Bearers:
+        (ids, total), *others = sorted((self._bearers_of(word) for word in words), key=lambda b: len(b[0]))
         for other, weights in others:
             both = np.isin(ids, other, assume_unique=True)
             ids, total = ids[both], total[both]
             total = total + weights[np.searchsorted(other, ids)]
         order = np.argsort(-total, kind="stable")[:limit]
-        return list(zip(ids[order].tolist(), total[order].tolist(), strict=True))
+        return ids[order], total[order]
 
-    def _bearers(self, word: str) -> _Bearers:
+    def _bearers_of(self, word: str) -> Bearers:
         """Return all that have a word, from what is kept while the file stays as it is."""
         state = self._connection.stamp()
         if state != self._kept_of:
@@ -75,8 +77,7 @@ class Words:
         kept = self._kept.get(word)
         if kept is None:
             rows = self._connection.rows("SELECT instance, weight FROM words WHERE word = ? ORDER BY instance", (word,))
-            held = np.array(rows, np.int64).reshape(-1, 2)
-            kept = self._kept.put(word, (held[:, 0].copy(), held[:, 1].astype(np.int16)))
+            kept = self._kept.put(word, self._bearers(rows))
         return kept
 
     def bearing_most(self, words: Sequence[str], limit: int) -> list[list[int]]:
@@ -99,6 +100,13 @@ class Words:
             if sum(weights.get(word, 0) for word in wanted) != totals[i.id] and self._is_current():
                 self._connection.refuse(f"words: those of instance {i.id} are not those of its label and description")
 
+    def _bearers(self, rows: Sequence[tuple[int, int]]) -> Bearers:
+        try:
+            held = np.array(rows, np.int64).reshape(-1, 2)
+            return held[:, 0].copy(), held[:, 1].astype(np.int16)
+        except UNREADABLE as error:
+            raise MemoryFileError(f"words cannot be read ({error}); run `list3r verify` on the file") from error
+
     def _is_current(self) -> bool:
         """Whether the table holds the words that this program knows."""
         return self._connection.rows(ASK_STAMP) == [STAMP]
@@ -120,5 +128,5 @@ class Words:
         return [(n, -total) for total, n in sorted(found)]
 
 
-def _kept() -> LruCache[str, _Bearers]:
+def _kept() -> LruCache[str, Bearers]:
     return LruCache(_KEPT_BYTES, lambda bearers: bearers[0].nbytes + bearers[1].nbytes)
