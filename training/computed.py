@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from training.further import train_further
+from training.further import RECESSED_HELD_SEED, rooms_of, train_further
 from training.samples import make_sample
 from training.swept import make_swept
 from training.train import (
@@ -29,6 +29,8 @@ from training.worlds.film import FilmSettings, drawn_sensor
 
 SWEPT_SEED, SWEPT_FITTED_SEED, SWEPT_ODD_SEED = 7000, 7300, 7500
 """Seeds of swept rooms count up from here, as those of `training.train` do from others."""
+RECESSED_SEED, RECESSED_FITTED_SEED, RECESSED_ODD_SEED = 7600, 7700, 7800
+"""Likewise of swept rooms with recesses."""
 
 
 def main() -> None:
@@ -36,6 +38,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of chunks, graphs, states and logs")
     parser.add_argument("--start", type=Path, required=True, help="weights to go on from")
     parser.add_argument("--swept", default="110,50,60", help="swept rooms: with loose furniture, built in, odd things")
+    parser.add_argument("--recessed", default="0,0,0", help="swept rooms with recesses, likewise")
     parser.add_argument("--simulated", default="300,150,150", help="of so many rooms of training.train those computed")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=5, help="of the first network; the second has one less")
@@ -43,15 +46,17 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     data = args.out / "swept"
-    loose, fitted, odd = map(int, args.swept.split(","))
-    found = [make_swept(SWEPT_SEED + k, data) for k in range(loose)]
-    found += [make_swept(SWEPT_FITTED_SEED + k, data, fitted=True) for k in range(fitted)]
-    seeds = range(SWEPT_ODD_SEED, SWEPT_ODD_SEED + odd)
-    found += [make_swept(seed, data, fitted=seed % 3 == 2, odd=ODD_SHARE) for seed in seeds]
+    seeds = SWEPT_SEED, SWEPT_FITTED_SEED, SWEPT_ODD_SEED
+    found = rooms_of(make_swept, data, seeds, args.swept, recessed=False)
+    seeds = RECESSED_SEED, RECESSED_FITTED_SEED, RECESSED_ODD_SEED
+    found += rooms_of(make_swept, data, seeds, args.recessed, recessed=True)
     rooms = [(p, few) for p in found if p is not None for few in (False, True)]
     rooms += [(p, False) for p in _simulated(args.out / "chunks", *map(int, args.simulated.split(",")))]
     held = [make_swept(FIRST_HELD_SEED + k, data, held_out=True) for k in range(args.held)]
     held += [make_swept(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(args.held)]
+    if args.recessed != "0,0,0":
+        for k in range(args.held):
+            held.append(make_swept(RECESSED_HELD_SEED + k, data, held_out=True, fitted=k % 2 == 1, recessed=True))
     left_out = [(p, False) for p in held if p is not None]
     weights = args.weights or args.out / "weights-computed.npz"
     train_further(rooms, left_out, args.out, args.epochs, weights, args.start)

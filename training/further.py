@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ RECESSED_HELD_SEED = 5900
 ENDS = (FIRST_ENDS[1], STATES[1], STATES[2])
 """What agglomeration passes through in the second network's lessons."""
 
+Made = TypeVar("Made")
 Rooms = list[tuple[Path, bool]]
 """Chunks, and whether each is learned from in few colours."""
 
@@ -66,9 +67,10 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     data = args.out / "chunks"
-    paths = _rooms(data, (FIRST_SEED, FIRST_FITTED_SEED, FIRST_ODD_SEED), args.known, recessed=False)
+    seeds = FIRST_SEED, FIRST_FITTED_SEED, FIRST_ODD_SEED
+    paths = rooms_of(make_sample, data, seeds, args.known, recessed=False)
     seeds = RECESSED_SEED, RECESSED_FITTED_SEED, RECESSED_ODD_SEED
-    paths += _rooms(data, seeds, args.recessed, recessed=True)
+    paths += rooms_of(make_sample, data, seeds, args.recessed, recessed=True)
     held = [make_sample(FIRST_HELD_SEED + k, data, held_out=True) for k in range(args.held)]
     held += [make_sample(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(args.held)]
     for k in range(args.held):
@@ -77,13 +79,15 @@ def main() -> None:
     train_further(rooms, left_out, args.out, args.epochs, args.weights or args.out / "weights.npz", args.start)
 
 
-def _rooms(folder: Path, seeds: tuple[int, int, int], counts: str, *, recessed: bool) -> list[Path]:
-    """Make rooms with loose furniture, with what is built in, and with what no catalogue knows."""
+def rooms_of(
+    make: Callable[..., Made], folder: Path, seeds: tuple[int, int, int], counts: str, *, recessed: bool
+) -> list[Made]:
+    """Make rooms with loose furniture, with what is built in, and with what no catalogue knows, so many of each."""
     loose, fitted, odd = map(int, counts.split(","))
     kinds = [(seeds[0] + k, False, 0.0) for k in range(loose)]
     kinds += [(seeds[1] + k, True, 0.0) for k in range(fitted)]
     kinds += [(seeds[2] + k, k % 3 == 2, ODD_SHARE) for k in range(odd)]
-    return [make_sample(seed, folder, fitted=built_in, odd=share, recessed=recessed) for seed, built_in, share in kinds]
+    return [make(seed, folder, fitted=built_in, odd=share, recessed=recessed) for seed, built_in, share in kinds]
 
 
 def train_further(rooms: Rooms, held: Rooms, out: Path, epochs: int, weights: Path, start: Path) -> None:

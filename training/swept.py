@@ -44,15 +44,22 @@ def _known(depth: np.ndarray, rng: np.random.Generator) -> Sparse:
 
 
 def make_swept(
-    seed: int, folder: Path, *, held_out: bool = False, fitted: bool = False, odd: float = 0.0
+    seed: int,
+    folder: Path,
+    *,
+    held_out: bool = False,
+    fitted: bool = False,
+    odd: float = 0.0,
+    recessed: bool = False,
 ) -> Path | None:
     """Make the chunk of a seed and write it, unless it is there; return its file, None where depth tells too little.
 
     Rooms with an odd seed are filmed half as far, with twice the frames a second.
     """
-    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd)
+    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd, recessed=recessed)
     if not path.exists():
-        settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd, sensor="computed")
+        kind = {"held_out": held_out, "fitted": fitted, "odd": odd, "recessed": recessed}
+        settings = FilmSettings(seed, sensor="computed", **kind)
         settings = settings if held_out else varied(settings)
         settings = replace(settings, every=1) if seed % 2 else settings
         film = make_film(settings)
