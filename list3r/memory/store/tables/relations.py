@@ -53,7 +53,10 @@ class RelationTable:
         self, predicates: Sequence[str], subjects: Iterable[int] | None, objects: Iterable[int] | None
     ) -> list[tuple[int, int]]:
         """Return the (subject, object) of all relations of some predicates between some instances; None is any, not
-        for both. Those of which there are fewer are looked up.
+        for both.
+
+        What leads to an answer: in a table that is not checked as a whole these rows are not, `among` checks those of
+        the answer.
         """
         ends = {c: sorted(map(int, ids)) for c, ids in (("subject", subjects), ("object", objects)) if ids is not None}
         first, *other = sorted(ends, key=lambda column: len(ends[column]))
