@@ -2,8 +2,8 @@
 
 python -m training.further --out DIR --start list3r/instances/learned/weights.npz
 
-More than half of the rooms are those of `training.train`, so that nothing is forgotten. Every step is kept in the
-folder and not done again.
+More than half of the rooms are those of `training.train`, and what is written is the mean of the networks before and
+after, so that nothing is forgotten. Every step is kept in the folder and not done again.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ RECESSED_HELD_SEED = 5900
 ENDS = (FIRST_ENDS[1], STATES[1], STATES[2])
 """What agglomeration passes through in the second network's lessons."""
 
+Arrays = Mapping[str, NDArray[Any]]
 Made = TypeVar("Made")
 Rooms = list[tuple[Path, bool]]
 """Chunks, and whether each is learned from in few colours."""
@@ -63,6 +64,7 @@ def main() -> None:
     parser.add_argument("--recessed", default="60,40,60", help="rooms with recesses, likewise")
     parser.add_argument("--held", type=int, default=12, help="left-out worlds of each kind, to calibrate on")
     parser.add_argument("--epochs", type=int, default=4, help="of the first network; the second has one less")
+    parser.add_argument("--kept", type=float, default=0.5, help="share of the networks as they were in that mean")
     parser.add_argument("--weights", type=Path, help="where the weights go; out/weights.npz without it")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -76,7 +78,9 @@ def main() -> None:
     for k in range(args.held):
         held.append(make_sample(RECESSED_HELD_SEED + k, data, held_out=True, fitted=k % 2 == 1, recessed=True))
     rooms, left_out = ([(p, few) for p in of for few in (False, True)] for of in (paths, held))
-    train_further(rooms, left_out, args.out, args.epochs, args.weights or args.out / "weights.npz", args.start)
+    weights = args.weights or args.out / "weights.npz"
+    train_further(rooms, left_out, args.out, args.epochs, weights, args.start)
+    write_weights(weights, mean_of(load_weights(args.start), load_weights(weights), args.kept))
 
 
 def rooms_of(
@@ -111,7 +115,18 @@ def train_further(rooms: Rooms, held: Rooms, out: Path, epochs: int, weights: Pa
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, last)}))  # noqa: T201
 
 
-def _write_state(arrays: Mapping[str, NDArray[Any]], part: str, folder: Path) -> None:
+def mean_of(before: Arrays, after: Arrays, kept: float) -> dict[str, NDArray[Any]]:
+    """Return the weights after training, the networks blended with those before: this keeps what both know (Wortsman
+    et al., Robust fine-tuning of zero-shot models, CVPR 2022). The judge of things is the new one.
+    """
+    blended = {n: np.asarray(v) for n, v in after.items()}
+    for n, v in blended.items():
+        if n.startswith(("fine.", "coarse.")) and np.issubdtype(v.dtype, np.floating):
+            blended[n] = (kept * np.asarray(before[n], np.float64) + (1.0 - kept) * v).astype(np.float32)
+    return blended
+
+
+def _write_state(arrays: Arrays, part: str, folder: Path) -> None:
     """Write the network of some weights as a fit that can be gone on from."""
     folder.mkdir(parents=True, exist_ok=True)
     held = {n.removeprefix(f"{part}."): torch.from_numpy(v) for n, v in arrays.items() if n.startswith(f"{part}.")}
