@@ -49,14 +49,14 @@ def main() -> None:
     seeds = SWEPT_SEED, SWEPT_FITTED_SEED, SWEPT_ODD_SEED
     found = rooms_of(make_swept, data, seeds, args.swept, recessed=False)
     seeds = RECESSED_SEED, RECESSED_FITTED_SEED, RECESSED_ODD_SEED
-    found += rooms_of(make_swept, data, seeds, args.recessed, recessed=True)
+    recessed = rooms_of(make_swept, data, seeds, args.recessed, recessed=True)
+    found += recessed
     rooms = [(p, few) for p in found if p is not None for few in (False, True)]
     rooms += [(p, False) for p in _simulated(args.out / "chunks", *map(int, args.simulated.split(",")))]
     held = [make_swept(FIRST_HELD_SEED + k, data, held_out=True) for k in range(args.held)]
     held += [make_swept(FIRST_FITTED_HELD_SEED + k, data, held_out=True, fitted=True) for k in range(args.held)]
-    if args.recessed != "0,0,0":
-        for k in range(args.held):
-            held.append(make_swept(RECESSED_HELD_SEED + k, data, held_out=True, fitted=k % 2 == 1, recessed=True))
+    for k in range(args.held if recessed else 0):
+        held.append(make_swept(RECESSED_HELD_SEED + k, data, held_out=True, fitted=k % 2 == 1, recessed=True))
     left_out = [(p, False) for p in held if p is not None]
     weights = args.weights or args.out / "weights-computed.npz"
     train_further(rooms, left_out, args.out, args.epochs, weights, args.start)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,30 +77,30 @@ def sample_of(film: Film, seed: int, every: int = 1, reconstruction: Reconstruct
     return Sample(seed, film.sensor, shown, ids, poses, film.things, up, reconstruction.depth_noise is not None)
 
 
-def make_sample(
-    seed: int,
-    folder: Path,
-    *,
-    held_out: bool = False,
-    fitted: bool = False,
-    odd: float = 0.0,
-    recessed: bool = False,
-) -> Path:
+class Kind(TypedDict, total=False):
+    """What rooms differ in besides their seed, see `FilmSettings`."""
+
+    held_out: bool
+    fitted: bool
+    odd: float
+    recessed: bool
+
+
+def make_sample(seed: int, folder: Path, **kind: Unpack[Kind]) -> Path:
     """Make the chunk of a seed and write it, unless it is there already; return its file."""
-    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd, recessed=recessed)
+    path = chunk_file(seed, folder, **kind)
     if not path.exists():
-        settings = FilmSettings(seed, held_out=held_out, fitted=fitted, odd=odd, recessed=recessed)
-        settings = settings if held_out else varied(settings)
+        settings = FilmSettings(seed, **kind)
+        settings = settings if settings.held_out else varied(settings)
         sample = sample_of(make_film(settings), seed, settings.every)
         write_sample(path, sample)
     return path
 
 
-def chunk_file(seed: int, folder: Path, *, held_out: bool, fitted: bool, odd: float, recessed: bool = False) -> Path:
+def chunk_file(seed: int, folder: Path, **kind: Unpack[Kind]) -> Path:
     """Return the file of the chunk of a seed."""
-    kinds = (("fitted-", fitted), ("odd-", odd), ("recessed-", recessed))
-    kind = f"{'test' if held_out else 'train'}-{''.join(name for name, wanted in kinds if wanted)}"
-    return folder / f"{kind}{seed:06d}.npz"
+    name = "".join(f"{word}-" for word in ("fitted", "odd", "recessed") if kind.get(word))
+    return folder / f"{'test' if kind.get('held_out') else 'train'}-{name}{seed:06d}.npz"
 
 
 def write_sample(path: Path, sample: Sample) -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
 from list3r.frames.base import Frame
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.mvs.stereo import PosedFrames, Sparse, dense_depth, stereo_noise
-from training.samples import chunk_file, sample_of, write_sample
+from training.samples import Kind, chunk_file, sample_of, write_sample
 from training.worlds.film import Film, FilmSettings, make_film, reconstruction_of, varied
 
 DRIFT_M, DRIFT_DEG = 0.003, 0.06
@@ -43,24 +44,15 @@ def _known(depth: np.ndarray, rng: np.random.Generator) -> Sparse:
     return np.stack([x, y], axis=1)[known].astype(np.float64), depth[y, x][known].astype(np.float64)
 
 
-def make_swept(
-    seed: int,
-    folder: Path,
-    *,
-    held_out: bool = False,
-    fitted: bool = False,
-    odd: float = 0.0,
-    recessed: bool = False,
-) -> Path | None:
+def make_swept(seed: int, folder: Path, **kind: Unpack[Kind]) -> Path | None:
     """Make the chunk of a seed and write it, unless it is there; return its file, None where depth tells too little.
 
     Rooms with an odd seed are filmed half as far, with twice the frames a second.
     """
-    path = chunk_file(seed, folder, held_out=held_out, fitted=fitted, odd=odd, recessed=recessed)
+    path = chunk_file(seed, folder, **kind)
     if not path.exists():
-        kind = {"held_out": held_out, "fitted": fitted, "odd": odd, "recessed": recessed}
         settings = FilmSettings(seed, sensor="computed", **kind)
-        settings = settings if held_out else varied(settings)
+        settings = settings if settings.held_out else varied(settings)
         settings = replace(settings, every=1) if seed % 2 else settings
         film = make_film(settings)
         found = swept(film, seed)
