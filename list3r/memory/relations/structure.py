@@ -27,7 +27,8 @@ class StructureSettings:
     """and this near where depth was computed: rooms bend, and up is known to two degrees."""
     least_flagged: float = 0.5
     """Of those, one of which the chunks took less than this share for structure lies on the floor, if they took what
-    is beside it for floor: a rug. 0 where depth was computed: by that a floor that bends looks like a rug."""
+    is beside it for floor: a rug. Likewise what is like a wall is none, if they took another surface nearby for one: a
+    door. 0 where depth was computed: by that a floor that bends looks like a rug."""
     bordered: float = 0.1
     """Share of a rug's outline at least that has floor beside it,"""
     beside_m: float = 0.15
@@ -71,7 +72,8 @@ def classify_structure(
     `floor_height` is the z of the floor at that place, None where it was not seen; `eye_level` gives the height of the
     cameras that saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level,
     lies at the floor, and is no rug, which chunks distinguish from the floor beside it; a ceiling is level, above
-    the cameras, and faces down; a wall is upright, tall and wide, and (nearly) nothing lies behind it. What the chunks
+    the cameras, and faces down; a wall is upright, tall and wide, (nearly) nothing lies behind it, and it is no door or
+    curtain, which chunks distinguish from a wall nearby. What the chunks
     flagged in the main and is none of these is `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet
     front stands in the room and is no structure. What lies near an instance decides, so `around` may be all instances
     (the default: those given) or those within `near_m`.
@@ -88,10 +90,12 @@ def classify_structure(
         gap = np.maximum(box[:, 0] - b.aabb[1], b.aabb[0] - box[:, 1]).max(axis=1)
         rows = np.flatnonzero(gap <= s.near_m * unit).tolist()
         kind = _classify(b, floor_height, eye_level, np.concatenate([cloud[n] for n in rows]), unit, s)
-        if kind == "floor" and b.flagged < s.least_flagged and floor_height is not None:
-            flagged = [known[n] for n in rows if known[n].flagged >= s.least_flagged]
+        flagged = [known[n] for n in rows if known[n].flagged >= s.least_flagged] if b.flagged < s.least_flagged else []
+        if kind == "floor" and floor_height is not None:
             floors = [n.points for n in flagged if _low(n, floor_height, unit, s)]
             kind = None if floors and _bordered(b.points, np.concatenate(floors), unit, s) else kind
+        elif kind == "wall" and any(_is_upright(n, s) for n in flagged):
+            kind = None
         out.append(kind or flagged_only([b])[0])
     return out
 
@@ -142,7 +146,7 @@ def _classify(
         return None
     if not _bounds(instance, cloud, unit, s):
         return None
-    if abs(instance.normal[2]) < np.sin(np.radians(s.level_deg)):
+    if _is_upright(instance, s):
         wide = float(max(instance.box.size[0], instance.box.size[1]))
         tall = float(instance.box.size[2])
         if tall >= s.wall_height_m * unit and wide >= s.wall_width_m * unit:
@@ -153,6 +157,10 @@ def _classify(
 def is_level(instance: InstanceGeometry, s: StructureSettings) -> bool:
     """Return whether an instance is a level surface; z must be up."""
     return instance.normal is not None and bool(abs(instance.normal[2]) > np.cos(np.radians(s.level_deg)))
+
+
+def _is_upright(instance: InstanceGeometry, s: StructureSettings) -> bool:
+    return instance.normal is not None and abs(float(instance.normal[2])) < np.sin(np.radians(s.level_deg))
 
 
 def _low(instance: InstanceGeometry, floor_height: float, unit: float, s: StructureSettings) -> bool:
