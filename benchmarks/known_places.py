@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sessions import MIN_PX, Due
+from sessions import MIN_PX, Due, is_elsewhere
 
 from list3r.evaluation.scene import read_scene
 from list3r.evaluation.trajectory import read_tum
@@ -25,7 +25,6 @@ _LEAST_FRAMES, _LEAST_SHARE, _BEHIND_M = 3, 0.6, 0.05
 _INSIDE = 0.3
 """Of its size, how far from its middle a thing is looked for."""
 _GRID = np.array(list(product((-_INSIDE, 0.0, _INSIDE), repeat=3)))
-_ELSEWHERE_M = 0.05
 
 Thing = dict[str, Any]
 Changes = set[tuple[str, int]]
@@ -76,7 +75,7 @@ class KnownPlaces:
             return True
         at, half = (np.array(thing["box"][k]) for k in ("center", "size"))
         others = [e for t, e in self.scenes[n].items() if t != thing["id"] and e["largest_px"] >= MIN_PX]
-        gone = _is_elsewhere(thing, self.scenes[n].get(thing["id"]))
+        gone = is_elsewhere(thing, self.scenes[n].get(thing["id"]))
         return gone and any((np.abs(np.array(e["box"]["center"]) - at) < half / 2).all() for e in others)
 
 
@@ -114,12 +113,8 @@ def _things(walk: Path) -> dict[int, Thing]:
     return {e["id"]: e for e in read_scene(walk / "truth.json")["instances"] if not e["structure"]}
 
 
-def _is_elsewhere(a: Thing, b: Thing | None) -> bool:
-    return b is None or float(np.linalg.norm(np.subtract(a["box"]["center"], b["box"]["center"]))) > _ELSEWHERE_M
-
-
 def _differences(before: dict[int, Thing], now: dict[int, Thing]) -> Changes:
-    moved = {("moved", t) for t in before.keys() & now.keys() if _is_elsewhere(before[t], now[t])}
+    moved = {("moved", t) for t in before.keys() & now.keys() if is_elsewhere(before[t], now[t])}
     return (
         moved
         | {("removed", t) for t in before.keys() - now.keys()}

@@ -39,6 +39,8 @@ from list3r.simulation.walk import camera_path
 
 MIN_PX = 150
 KINDS = ("moved", "removed", "added")
+ELSEWHERE_M = 0.05
+"""What was carried less far is where it was."""
 
 
 class ReturnWalk(ChangedWalk):
@@ -170,10 +172,19 @@ def _changes(scenes: Sequence[dict[str, Any]], least_px: int = MIN_PX) -> set[tu
     a, b = ({e["id"]: e for e in s["instances"] if not e["structure"]} for s in scenes)
     seen_a, seen_b = ({k for k, e in s.items() if e["largest_px"] >= least_px} for s in (a, b))
     out = {("removed", k) for k in seen_a - set(b)} | {("added", k) for k in seen_b - set(a)}
-    for k in seen_a & seen_b:
-        if np.linalg.norm(np.array(a[k]["box"]["center"]) - b[k]["box"]["center"]) > 0.05:
-            out.add(("moved", k))
-    return out
+    return out | {("moved", k) for k in seen_a & seen_b if is_elsewhere(a[k], b[k])}
+
+
+def is_elsewhere(a: dict[str, Any], b: dict[str, Any] | None) -> bool:
+    """Whether a thing of one truth stands elsewhere in another. Where the truth says how far it was `carried`, that
+    decides: boxes of what was seen of a thing lie elsewhere where another side of it was seen.
+    """
+    if b is None:
+        return True
+    places = (
+        (a["carried"], b["carried"]) if "carried" in a and "carried" in b else (a["box"]["center"], b["box"]["center"])
+    )
+    return float(np.linalg.norm(np.subtract(*places))) > ELSEWHERE_M
 
 
 def _told(
