@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.change.places import Places
@@ -24,7 +27,7 @@ from list3r.memory.overlap.visibility import (
 )
 from list3r.memory.records import Edge
 from list3r.memory.store.store import Store
-from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
+from tests.session_scenes import ROOM, Box, add_session, cameras, cast, place_together, simulated_chunk
 
 TABLE = (0.0, 0.0, 0.75)
 S = VisibilitySettings()
@@ -179,3 +182,59 @@ def test_two_that_change_places_both_move(tmp_path: Path) -> None:
             assert event.from_box is not None
             assert event.to_box is not None
             assert 0.9 < float(np.linalg.norm(event.to_box.center - event.from_box.center)) < 1.1
+
+
+SHEET = Box((0.0, 0.25, 0.742), (0.30, 0.20, 0.004), (240, 240, 235))
+"""Lies on the table, too thin for depth to tell it from that."""
+
+
+def _add_pictured(store: Store, room: dict[str, Box], start: float, light: float, found: dict[str, Box]) -> None:
+    """Add a session whose keyframes have pictures in some light, and of whose room only so much was found."""
+    lit = {k: replace(b, rgb=tuple(int(light * c) for c in b.rgb)) for k, b in room.items()}
+    poses = np.concatenate([cameras(TABLE, start), cameras(TABLE, start + 0.1)])
+    chunk = simulated_chunk(lit, poses)
+    colors = np.array([*(b.rgb for b in lit.values()), (0, 0, 0)], np.uint8)
+    keyframes = []
+    for keyframe in chunk.keyframes:
+        picture = io.BytesIO()
+        Image.fromarray(colors[cast(lit, keyframe.T_chunk_cam)[1]]).save(picture, "jpeg", quality=95)
+        keyframes.append(replace(keyframe, jpeg=picture.getvalue()))
+    known = [tuple(lit[k].rgb) for k in found if k in lit]
+    kept = [i for i in chunk.library.instances if tuple(i.support.rgb[0].tolist()) in known]
+    kept = [replace(i, local_id=n) for n, i in enumerate(kept)]
+    session = store.sessions.add("simulated", f"{len(store.sessions.all())}", {}, len(poses))
+    store.chunks.add(
+        session, replace(chunk, keyframes=tuple(keyframes), library=replace(chunk.library, instances=tuple(kept)))
+    )
+
+
+WITH_SHEET = {**ROOM, "sheet": SHEET}
+
+
+@pytest.mark.parametrize("light", [1.0, 0.7])
+@pytest.mark.parametrize(
+    ("first", "second", "found", "told"),
+    [
+        (WITH_SHEET, dict(ROOM), dict(ROOM), ["removed"]),
+        (dict(ROOM), WITH_SHEET, WITH_SHEET, ["added"]),
+        (WITH_SHEET, WITH_SHEET, dict(ROOM), []),
+    ],
+)
+def test_a_sheet_that_depth_cannot_tell_from_its_table_is_missed_by_its_colour(
+    tmp_path: Path, first: dict[str, Box], second: dict[str, Box], found: dict[str, Box], told: list[str], light: float
+) -> None:
+    """But not where it only was not found: the pictures show it."""
+    with Store.create(tmp_path / "a.l3r") as store:
+        for room, start, bright, known in ((first, 0.4, 1.0, first), (second, 1.0, light, found)):
+            with store.transaction():
+                _add_pictured(store, room, start, bright, known)
+                place_together(store)
+                consolidate(store)
+        events = [e for e in store.events.all(2) if e.kind != "seen_again"]
+        assert [e.kind for e in events] == told
+        assert all("another surface in its place" in e.reason for e in events)
+
+
+def test_without_pictures_depth_alone_tells(tmp_path: Path) -> None:
+    with Store.open(_two(tmp_path / "a.l3r", dict(ROOM), WITH_SHEET)) as store:
+        assert [e.kind for e in store.events.all(2) if e.kind != "seen_again"] == []

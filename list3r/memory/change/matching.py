@@ -228,7 +228,7 @@ class ChangeMatching:
         placed.state = "removed"
         self._told_gone.add(placed.places[0])
         box = self._p.box(placed.now, session, before=True)
-        reason = f"{len(found.frames)} frames see through its place ({found.free:.0%} of what could be judged)"
+        reason = f"{_frames_see(found)} ({found.free:.0%} of what could be judged)"
         self._record(
             placed, Change(self._first(placed), session, "removed", box, None, found.frames, self._sure(found), reason)
         )
@@ -237,7 +237,7 @@ class ChangeMatching:
         placed = self._placed[place]
         placed.state = "added"
         box = self._p.box(place, session, before=False)
-        seen = f"{len(found.frames)} frames of an earlier session see through its place"
+        seen = _frames_see(found, " of an earlier session")
         known = found.verdict == "gone"
         reason = seen if known else "it stands where something else stood that is gone"
         sure = self._sure(found) if known else 0.5
@@ -305,6 +305,11 @@ class ChangeMatching:
                 states[keys[0]] = placed.state
         events = tuple(replace(c, first=names[n]) for n, c in self._events if n in names)
         return Changes(sorted(groups), current, states, events, self._decisions)
+
+
+def _frames_see(found: PlaceVisibility, of: str = "") -> str:
+    what = "see another surface in its place" if found.by_color else "see through its place"
+    return f"{len(found.frames)} frames{of} {what}"
 
 
 def _height(box: OrientedBox) -> float:

@@ -18,12 +18,15 @@ from list3r.memory.change.surface_colors import (
     color_distance,
     lab,
     meeting,
+    small_picture,
 )
 from list3r.memory.geometry import Array, OrientedBox
 from list3r.memory.merging.edges import Key
 from list3r.memory.overlap.summaries import ChunkSummary, world_unit
 from list3r.memory.overlap.visibility import (
     DepthView,
+    Ints,
+    OtherSurface,
     PlaceVisibility,
     changed_points,
     in_sight_of,
@@ -79,6 +82,7 @@ class Places:
         self._stayed: dict[tuple[int, int], OrientedBox] = {}
         self._frames: dict[tuple[int, int], int] = {}
         self._summaries: dict[int, tuple[float, Array]] = {}
+        self._pictures: dict[tuple[int, int], Colors | None] = {}
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
@@ -115,9 +119,15 @@ class Places:
 
     def points(self, n: int, session: int, *, before: bool, stayed: bool = False) -> Array:
         """Return some surface points, world coordinates. Shape (N, 3)."""
-        parts = [self._points_of(key) for key in self.members(n, session, before=before, stayed=stayed)]
-        points = np.concatenate(parts) if parts else np.zeros((0, 3))
-        return points[:: max(1, len(points) // self._s.points)]
+        return self._thinned(n, session, before=before, stayed=stayed)[0]
+
+    def _thinned(self, n: int, session: int, *, before: bool, stayed: bool = False) -> tuple[Array, Colors]:
+        """Return the same and their colours. Shape (N, 3) each."""
+        keys = self.members(n, session, before=before, stayed=stayed)
+        points = np.concatenate([self._points_of(key) for key in keys]) if keys else np.zeros((0, 3))
+        rgb = np.concatenate([self._colors_of(key) for key in keys]) if keys else np.zeros((0, 3), np.uint8)
+        step = max(1, len(points) // self._s.points)
+        return points[::step], rgb[::step]
 
     def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
         """Return the box of what was seen of it; unless it has stayed, of what of that has changed."""
@@ -173,32 +183,64 @@ class Places:
 
     def look_after(self, n: int, session: int) -> PlaceVisibility:
         """Return what a session's frames see where an instance was before."""
-        points = self.points(n, session, before=True)
-        return self._look(points, self._views_of(session, self.component[n]), session)
+        return self._look(n, self._views_of(session, self.component[n]), session, before=True)
 
     def look_before(self, n: int, session: int) -> PlaceVisibility:
         """Return what the frames of the last session that could tell saw where an instance is now.
 
         A session of which too few frames tell is passed over where one before it can.
         """
-        points, doubtful = self.points(n, session, before=False), PlaceVisibility("unseen", 0.0, ())
+        doubtful = PlaceVisibility("unseen", 0.0, ())
         for views in self._views_before(n, session):
-            found = self._look(points, views, session)
+            found = self._look(n, views, session, before=False)
             if found.verdict == "unclear" and len(found.frames) < self._s.visibility.least_frames:
                 doubtful = found if doubtful.verdict == "unseen" else doubtful
             elif found.verdict != "unseen":
                 return found
         return doubtful
 
-    def _look(self, points: Array, views: Sequence[DepthView], session: int) -> PlaceVisibility:
-        """Return what frames see at a place; nothing is told of what may be there as the session may lie."""
-        found, s = place_visibility(points, views, self._s.visibility), self._s
+    def _look(self, n: int, views: Sequence[DepthView], session: int, *, before: bool) -> PlaceVisibility:
+        """Return what frames see at a place, by depth and, where that sees a surface, by its colours; nothing is told
+        of what may be there as the session may lie.
+        """
+        (points, rgb), s = self._thinned(n, session, before=before), self._s
+        found, other = place_visibility(points, views, s.visibility), None
+        if found.verdict in ("there", "unclear"):
+            other = self._other_colors(rgb, session, before=before)
+            by_color = found if other is None else place_visibility(points, views, s.visibility, other)
+            found = by_color if by_color.verdict == "gone" else found
         if found.verdict == "gone":
             known = s.visibility.tolerance_m * self.unit
             for shift in self.ties.shifts(session, points.mean(axis=0), s.placed_deviations, known):
-                if place_visibility(points + shift, views, s.visibility).verdict != "gone":
+                if place_visibility(points + shift, views, s.visibility, other).verdict != "gone":
                     return PlaceVisibility("unseen", 0.0, ())
         return found
+
+    def _other_colors(self, rgb: Colors, session: int, *, before: bool) -> OtherSurface | None:
+        """Return what tells whether frames show other colours than points have; None where the light is not known.
+
+        The points were seen `before` the session and the frames are of it, or the other way round. Shape (N, 3).
+        """
+        light = self.light(session)
+        if light is SAME_LIGHT:
+            return None
+        own, limit = light.lab(rgb) if before else lab(rgb), light.limit(self._s)
+
+        def other(view: DepthView, points: Array, rows: Ints) -> NDArray[np.bool_]:
+            picture = self._picture(view)
+            if picture is None:
+                return np.zeros(len(rows), bool)
+            u, v = view.pixels(points)
+            shown = lab(picture[v, u]) if before else light.lab(picture[v, u])
+            return color_distance(own[rows], shown) > limit
+
+        return other
+
+    def _picture(self, view: DepthView) -> Colors | None:
+        name = view.chunk_id, view.frame_index
+        if name not in self._pictures:
+            self._pictures[name] = small_picture(self._store.keyframes.get(*name).jpeg, *view.depth.shape)
+        return self._pictures[name]
 
     def changed(self, n: int, session: int, *, before: bool) -> float:
         """Return the share of its surface that is seen through, of what is told: of what was, by a session that comes

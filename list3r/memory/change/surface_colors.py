@@ -7,6 +7,7 @@ they lie about it is the noise (decision 0059).
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,3 +139,15 @@ def other_surfaces(u: ChunkShapes, v: ChunkShapes, p: PairScores, S_v_u: Sim3, s
         if len(a) >= _LEAST_POINTS and not (u.structure[p.i[n]] or v.structure[p.j[n]]):
             out[n] = float(np.median(color_distance(light.lab(a), lab(b)))) > light.limit(s)
     return out
+
+
+def small_picture(jpeg: bytes, height: int, width: int) -> Colors | None:
+    """Return a stored picture at the size of the depth image beside it, RGB, shape (h, w, 3); None if damaged."""
+    from PIL import Image
+
+    try:
+        picture = Image.open(io.BytesIO(jpeg))
+        picture.draft("RGB", (width, height))
+        return np.asarray(picture.convert("RGB").resize((width, height), Image.Resampling.BOX))
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return None

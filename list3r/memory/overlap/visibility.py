@@ -6,7 +6,7 @@ of an instance nor a small error of alignment looks like free space.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,13 @@ class DepthView:
     """Chunk units, 0 where unknown. Shape (h, w)."""
     camera: tuple[float, float, float, float]
     """fx, fy, cx, cy of `depth`, px."""
+    chunk_id: int = 0
+
+    def pixels(self, points: Array) -> tuple[Ints, Ints]:
+        """Return the columns and rows of `depth` nearest to points before the camera, world coordinates, (N, 3)."""
+        p, (fx, fy, cx, cy) = self.S_cam_world.apply(points), self.camera
+        u, v = p[:, 0] / p[:, 2] * fx + cx, p[:, 1] / p[:, 2] * fy + cy
+        return np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,8 @@ class PlaceVisibility:
     """Share of what was told that is free space."""
     frames: tuple[tuple[int, int], ...]
     """(session id, Frame.index) of the frames that told, the most telling first."""
+    by_color: bool = False
+    """Gone, because what is measured there has other colours."""
 
 
 def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyframe]], unit: float) -> list[DepthView]:
@@ -80,7 +89,13 @@ def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyfra
                 in_chunk = unit / float(c.S_world_chunk.scale)
                 out.append(
                     DepthView(
-                        c.session_id, k.frame_index, S_world_cam.inverse(), in_chunk, k.depth_small, k.camera_small
+                        c.session_id,
+                        k.frame_index,
+                        S_world_cam.inverse(),
+                        in_chunk,
+                        k.depth_small,
+                        k.camera_small,
+                        c.chunk_id,
                     )
                 )
     return out
@@ -98,14 +113,24 @@ def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> 
     ]
 
 
+OtherSurface = Callable[[DepthView, Array, Ints], NDArray[np.bool_]]
+"""Tells of points at which a view measures a surface (M, 3), and of their rows (M,), whether that is another one."""
+
+
 def place_visibility(
-    points: Array, views: Iterable[DepthView], settings: VisibilitySettings | None = None
+    points: Array,
+    views: Iterable[DepthView],
+    settings: VisibilitySettings | None = None,
+    other: OtherSurface | None = None,
 ) -> PlaceVisibility:
-    """Ask frames about surface points of one instance, world coordinates, shape (N, 3)."""
+    """Ask frames about surface points of one instance, world coordinates, shape (N, 3).
+
+    Where `other` tells that the surface at a point is another one, that counts as free space.
+    """
     s = settings or VisibilitySettings()
     verdicts = []
     for view in views:
-        there, free = _counts(points, view, s)
+        there, free = _counts(points, view, s, other)
         if there + free >= max(s.least_points, s.least_share * len(points)):
             verdicts.append((there + free, free, (view.session_id, view.frame_index)))
     if not verdicts:
@@ -120,7 +145,7 @@ def place_visibility(
     else:
         verdict, kept = "unclear", np.ones(len(verdicts), bool)
     best = sorted((t for t, k in zip(verdicts, kept, strict=True) if k), key=lambda t: (-t[0], t[2]))
-    return PlaceVisibility(verdict, share, tuple(t[2] for t in best))
+    return PlaceVisibility(verdict, share, tuple(t[2] for t in best), verdict == "gone" and other is not None)
 
 
 UNTOLD, MET, FREE = 0, 1, 2
@@ -193,7 +218,11 @@ def seen_through_shares(
     return out
 
 
-def _counts(points: Array, view: DepthView, s: VisibilitySettings) -> tuple[int, int]:
+def _counts(points: Array, view: DepthView, s: VisibilitySettings, other: OtherSurface | None) -> tuple[int, int]:
     """Return how many points of a surface one frame sees where they should be, and through how many it sees further."""
     seen = point_visibility(points, view, s)
-    return int((seen == MET).sum()), int((seen == FREE).sum())
+    met, free = seen == MET, int((seen == FREE).sum())
+    if other is None or not met.any():
+        return int(met.sum()), free
+    replaced = int(other(view, points[met], np.flatnonzero(met)).sum())
+    return int(met.sum()) - replaced, free + replaced
