@@ -57,6 +57,7 @@ class DepthView:
     camera: tuple[float, float, float, float]
     """fx, fy, cx, cy of `depth`, px."""
     chunk_id: int = 0
+    """Chunk of the keyframe, 0 where nobody asks for its picture."""
 
     def pixels(self, points: Array) -> tuple[Ints, Ints]:
         """Return the columns and rows of `depth` nearest to points before the camera, world coordinates, (N, 3)."""

@@ -73,10 +73,10 @@ def classify_structure(
     cameras that saw an instance (90 % of them are below); `unit` is what a metre is in world units. A floor is level,
     lies at the floor, and is no rug, which chunks distinguish from the floor beside it; a ceiling is level, above
     the cameras, and faces down; a wall is upright, tall and wide, (nearly) nothing lies behind it, and it is no door or
-    curtain, which chunks distinguish from a wall nearby. What the chunks
-    flagged in the main and is none of these is `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet
-    front stands in the room and is no structure. What lies near an instance decides, so `around` may be all instances
-    (the default: those given) or those within `near_m`.
+    curtain, which chunks distinguish from a wall nearby. What the chunks flagged in the main and is none of these is
+    `plane`: a bit of a wall, a ledge, a corner. A table top or a cabinet front stands in the room and is no structure.
+    What lies near an instance decides, so `around` may be all instances (the default: those given) or those within
+    `near_m`.
     """
     s = settings or StructureSettings()
     known = instances if around is None else around
