@@ -110,6 +110,16 @@ def summary() -> str:
                 ]
                 for name, t in _sessions()[:1]
             ),
+            *(
+                [
+                    f"changes between two sessions, {name}",
+                    "F1 of records",
+                    f"{_read(file)['total']['learned']['all']['f1']:.2f}",
+                    "",
+                    _commit(file),
+                ]
+                for name, file in _ELSEWHERE.items()
+            ),
             [
                 "`nearest` among a million instances",
                 "processor time, median",
@@ -352,13 +362,18 @@ def alignment() -> str:
     return _table(["mean error: position, rotation (degrees), scale", *heads], rows)
 
 
+_ELSEWHERE = {
+    "six held-out simulated worlds": "changes-elsewhere",
+    "six walks in a house modelled by others": "changes-elsewhere-house",
+}
+
+
 def changes() -> str:
     """Return the table of second sessions."""
     kinds = ("moved", "removed", "added", "all")
     runs = {
         **dict(_sessions()),
-        "six left-out worlds of training, filmed twice": _read("changes-elsewhere")["total"]["learned"],
-        "six walks, each filmed twice, in a house modelled by others": _read("changes-elsewhere-house")["total"]["learned"],
+        **{name: _read(file)["total"]["learned"] for name, file in _ELSEWHERE.items()},
     }
     rows = [[name, *(f"{total[k]['f1']:.2f}" for k in kinds)] for name, total in runs.items()]
     return _table(["F1 of change records", *kinds], rows)
