@@ -101,24 +101,8 @@ def summary() -> str:
                 _commit("simulated"),
             ],
             *(
-                [
-                    f"changes between two sessions, {name}",
-                    "F1 of records",
-                    f"{t['all']['f1']:.2f}",
-                    "",
-                    _commit("sessions"),
-                ]
-                for name, t in _sessions()[:1]
-            ),
-            *(
-                [
-                    f"changes between two sessions, {name}",
-                    "F1 of records",
-                    f"{_read(file)['total']['learned']['all']['f1']:.2f}",
-                    "",
-                    _commit(file),
-                ]
-                for name, file in _ELSEWHERE.items()
+                [f"changes between two sessions, {name}", "F1 of records", f"{t['all']['f1']:.2f}", "", _commit(file)]
+                for name, t, file in [(*_sessions()[0], "sessions"), *_elsewhere()]
             ),
             [
                 "`nearest` among a million instances",
@@ -362,19 +346,19 @@ def alignment() -> str:
     return _table(["mean error: position, rotation (degrees), scale", *heads], rows)
 
 
-_ELSEWHERE = {
-    "six held-out simulated worlds": "changes-elsewhere",
-    "six walks in a house modelled by others": "changes-elsewhere-house",
-}
+def _elsewhere() -> list[tuple[str, dict[str, Any], str]]:
+    """Names, figures and files of second sessions in homes that our simulator did not make."""
+    files = {
+        "six held-out simulated worlds": "changes-elsewhere",
+        "six walks in a house modelled by others": "changes-elsewhere-house",
+    }
+    return [(name, _read(file)["total"]["learned"], file) for name, file in files.items()]
 
 
 def changes() -> str:
     """Return the table of second sessions."""
     kinds = ("moved", "removed", "added", "all")
-    runs = {
-        **dict(_sessions()),
-        **{name: _read(file)["total"]["learned"] for name, file in _ELSEWHERE.items()},
-    }
+    runs = dict(_sessions()) | {name: total for name, total, _ in _elsewhere()}
     rows = [[name, *(f"{total[k]['f1']:.2f}" for k in kinds)] for name, total in runs.items()]
     return _table(["F1 of change records", *kinds], rows)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,8 @@ from list3r.memory.relations.instance_geometry import fit_box
 from list3r.memory.store.store import Store
 from list3r.memory.world.session_ties import SessionTies
 
+_PICTURES = 256
+"""Small pictures of keyframes that are kept at a time: what is asked about next stands near by."""
 _SPREAD = 0.02
 """Share of points outside the box at either end by which instances are compared."""
 
@@ -82,7 +85,7 @@ class Places:
         self._stayed: dict[tuple[int, int], OrientedBox] = {}
         self._frames: dict[tuple[int, int], int] = {}
         self._summaries: dict[int, tuple[float, Array]] = {}
-        self._pictures: dict[tuple[int, int], Colors | None] = {}
+        self._picture = lru_cache(_PICTURES)(self._read_picture)
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
 
@@ -227,7 +230,7 @@ class Places:
         own, limit = light.lab(rgb) if before else lab(rgb), light.limit(self._s)
 
         def other(view: DepthView, points: Array, rows: Ints) -> NDArray[np.bool_]:
-            picture = self._picture(view)
+            picture = self._picture(view.chunk_id, view.frame_index, *view.depth.shape)
             if picture is None:
                 return np.zeros(len(rows), bool)
             u, v = view.pixels(points)
@@ -236,11 +239,8 @@ class Places:
 
         return other
 
-    def _picture(self, view: DepthView) -> Colors | None:
-        name = view.chunk_id, view.frame_index
-        if name not in self._pictures:
-            self._pictures[name] = small_picture(self._store.keyframes.get(*name).jpeg, *view.depth.shape)
-        return self._pictures[name]
+    def _read_picture(self, chunk_id: int, frame_index: int, height: int, width: int) -> Colors | None:
+        return small_picture(self._store.keyframes.get(chunk_id, frame_index).jpeg, height, width)
 
     def changed(self, n: int, session: int, *, before: bool) -> float:
         """Return the share of its surface that is seen through, of what is told: of what was, by a session that comes
