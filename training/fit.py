@@ -75,6 +75,8 @@ class FitSettings:
     least_weight: float = 0.0
     """What every border counts, however short it is, beside the logarithm of its length: legs are thin."""
     seed: int = 0
+    device: str | None = None
+    """Where it runs; None: the first GPU where there is one."""
     start: Path | None = None
     """Folder of an earlier fit to go on from, its learning rate a third."""
     blind: Blindness = field(default_factory=lambda: SEEING)
@@ -83,20 +85,25 @@ class FitSettings:
 def fit(
     network: PieceNetwork, lessons: Sequence[Lesson], held: Sequence[Lesson], folder: Path, settings: FitSettings
 ) -> PieceNetwork:
-    """Train a network; a state of each epoch in `folder` lets an interrupted run go on, `log.jsonl` tells losses."""
+    """Train a network; a state of each epoch in `folder` lets an interrupted run go on, `log.jsonl` tells losses.
+
+    The first GPU is used where there is one; weights are the same to the bit only on the CPU.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
+    device = torch.device(settings.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     rate = settings.rate
     if settings.start is None:
         _standardise(network, lessons, settings.blind)
     else:
         load_earlier(network, settings.start)
         rate /= 3.0
+    network.to(device)
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=settings.decay)
     (folder / "labels.json").write_text(json.dumps(LABELS))
     state, start = folder / "state.pt", 0
     if state.exists():
-        saved = torch.load(state, weights_only=True)
+        saved = torch.load(state, weights_only=True, map_location=device)
         network.load_state_dict(saved["network"])
         optimiser.load_state_dict(saved["optimiser"])
         start = int(saved["epoch"])
@@ -121,12 +128,12 @@ def fit(
         print(json.dumps(entry), flush=True)  # noqa: T201
         kept = {"network": network.state_dict(), "optimiser": optimiser.state_dict(), "epoch": epoch + 1}
         torch.save(kept | ({} if mean is None else {"mean": mean.state_dict()}), state)
-    return network if mean is None else mean.module
+    return (network if mean is None else mean.module).cpu()
 
 
 def load_earlier(network: PieceNetwork, folder: Path) -> None:
     """Take over the weights of an earlier fit; names are matched by their words, new ones start from scratch."""
-    state = torch.load(folder / "state.pt", weights_only=True)
+    state = torch.load(folder / "state.pt", weights_only=True, map_location="cpu")
     means = {k.removeprefix("module."): v for k, v in state.get("mean", {}).items() if k.startswith("module.")}
     saved = means or state["network"]
     row = {word: 1 + k for k, word in enumerate(json.loads((folder / "labels.json").read_text()))}
@@ -141,16 +148,13 @@ def load_earlier(network: PieceNetwork, folder: Path) -> None:
     network.load_state_dict(saved)
 
 
-def tensors(lesson: Lesson) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def tensors(lesson: Lesson, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return what a network takes."""
     g = lesson.graph
-    return (
-        torch.from_numpy(g.nodes),
-        torch.from_numpy(g.left),
-        torch.from_numpy(g.right),
-        torch.from_numpy(g.edges),
-        torch.from_numpy(g.reversed_edges()),
+    nodes, left, right, edges, back = (
+        torch.from_numpy(a).to(device) for a in (g.nodes, g.left, g.right, g.edges, g.reversed_edges())
     )
+    return nodes, left, right, edges, back
 
 
 def _standardise(network: PieceNetwork, lessons: Sequence[Lesson], blind: Blindness) -> None:
@@ -175,21 +179,22 @@ def _step(
     network: PieceNetwork, optimiser: torch.optim.Optimizer, lesson: Lesson, settings: FitSettings
 ) -> dict[str, float]:
     network.train()
+    device = network.node_mean.device
     affinity, structure, names, _ = network(*_disturbed(network, lesson, settings))
     same, known, weight = truths(lesson)
-    w = torch.from_numpy(weight + np.float32(settings.least_weight) * known)
+    w = torch.from_numpy(weight + np.float32(settings.least_weight) * known).to(device)
     pair = F.binary_cross_entropy_with_logits(
-        affinity, torch.from_numpy(same.astype(np.float32)), w, reduction="sum"
+        affinity, torch.from_numpy(same.astype(np.float32)).to(device), w, reduction="sum"
     ) / w.sum().clamp(min=1)
-    size = torch.from_numpy(np.sqrt(lesson.size) * (lesson.thing > 0))
+    size = torch.from_numpy(np.sqrt(lesson.size) * (lesson.thing > 0)).to(device)
     bound = F.binary_cross_entropy_with_logits(
-        structure, torch.from_numpy(lesson.structure.astype(np.float32)), size, reduction="sum"
+        structure, torch.from_numpy(lesson.structure.astype(np.float32)).to(device), size, reduction="sum"
     )
     bound = bound / size.sum().clamp(min=1)
-    named = torch.from_numpy(np.flatnonzero(lesson.name >= 0))
-    word = torch.zeros(())
+    named = torch.from_numpy(np.flatnonzero(lesson.name >= 0)).to(device)
+    word = torch.zeros((), device=device)
     if len(named):
-        word = F.cross_entropy(names[named], torch.from_numpy(lesson.name)[named], label_smoothing=0.05)
+        word = F.cross_entropy(names[named], torch.from_numpy(lesson.name).to(device)[named], label_smoothing=0.05)
     loss = pair + 0.5 * bound + settings.name_share * word
     optimiser.zero_grad()
     loss.backward()
@@ -202,7 +207,7 @@ def _disturbed(
     network: PieceNetwork, lesson: Lesson, settings: FitSettings
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What a network takes, with noise on the features, and some not seen; both ways of a border keep the same."""
-    nodes, left, right, edges, back = tensors(lesson)
+    nodes, left, right, edges, back = tensors(lesson, network.node_mean.device)
     if settings.noise > 0:
         nodes = nodes + settings.noise * network.node_std * torch.randn_like(nodes)
         shift = settings.noise * network.edge_std * torch.randn_like(edges)
@@ -234,9 +239,9 @@ def score(network: PieceNetwork, lessons: Sequence[Lesson]) -> dict[str, float]:
         "held_name": [],
     }
     for lesson in lessons:
-        affinity, structure, names, _ = network(*tensors(lesson))
+        affinity, structure, names, _ = network(*tensors(lesson, network.node_mean.device))
         same, _, weight = truths(lesson)
-        told = affinity.numpy()
+        told = affinity.cpu().numpy()
         loss = np.logaddexp(0, told) - told * same
         right["held_pair"].append(float((loss * weight).sum() / max(weight.sum(), 1)))
         apart, inside = weight * ~same, weight * same
@@ -244,11 +249,10 @@ def score(network: PieceNetwork, lessons: Sequence[Lesson]) -> dict[str, float]:
         right["held_same_kept"].append(float((inside * (told > 0)).sum() / max(inside.sum(), 1e-6)))
         size = lesson.size * (lesson.thing > 0)
         right["held_structure"].append(
-            float((size * ((structure.numpy() > 0) == lesson.structure)).sum() / max(size.sum(), 1))
+            float((size * ((structure.cpu().numpy() > 0) == lesson.structure)).sum() / max(size.sum(), 1))
         )
         named = lesson.name >= 0
         if named.any():
-            right["held_name"].append(
-                float((lesson.size * (names.numpy().argmax(1) == lesson.name))[named].sum() / lesson.size[named].sum())
-            )
+            told_right = names.cpu().numpy().argmax(1) == lesson.name
+            right["held_name"].append(float((lesson.size * told_right)[named].sum() / lesson.size[named].sum()))
     return {k: round(float(np.mean(v)), 4) if v else 0.0 for k, v in right.items()}

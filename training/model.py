@@ -22,7 +22,7 @@ class _Layer(nn.Module):
 
     def forward(self, h: Tensor, e: Tensor, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         m = torch.relu(self.here(h)[target] + self.there(h)[source] + self.way(e))
-        size = torch.zeros(len(h), 1).index_add_(0, target, torch.ones(len(target), 1)).clamp(min=1)
+        size = h.new_zeros(len(h), 1).index_add_(0, target, h.new_ones(len(target), 1)).clamp(min=1)
         mean = torch.zeros_like(h).index_add_(0, target, m) / size
         most = torch.zeros_like(h).scatter_reduce(0, target[:, None].expand_as(m), m, "amax", include_self=True)
         h = self.norm(h + self.drop(self.update(torch.cat([h, mean, most], 1))))
