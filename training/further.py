@@ -3,8 +3,7 @@
 python -m training.further --out DIR --start list3r/instances/learned/weights.npz
 
 More than half of the rooms are those of `training.train`, and what is written is the mean of the networks before and
-after, so that nothing is forgotten, with a judge of things that learned from what this mean makes. Every step is kept
-in the folder and not done again.
+after, so that nothing is forgotten. Every step is kept in the folder and not done again.
 """
 
 from __future__ import annotations
@@ -80,10 +79,8 @@ def main() -> None:
         held.append(make_sample(RECESSED_HELD_SEED + k, data, held_out=True, fitted=k % 2 == 1, recessed=True))
     rooms, left_out = ([(p, few) for p in of for few in (False, True)] for of in (paths, held))
     weights = args.weights or args.out / "weights.npz"
-    after, mean = args.out / "after.npz", args.out / "mean.npz"
-    train_further(rooms, left_out, args.out, args.epochs, after, args.start)
-    write_weights(mean, mean_of(load_weights(args.start), load_weights(after), args.kept))
-    write_weights(weights, judged_anew(load_weights(mean), rooms, left_out, args.out / "judged"))
+    train_further(rooms, left_out, args.out, args.epochs, weights, args.start)
+    write_weights(weights, mean_of(load_weights(args.start), load_weights(weights), args.kept))
 
 
 def rooms_of(
@@ -127,13 +124,6 @@ def mean_of(before: Arrays, after: Arrays, kept: float) -> dict[str, NDArray[Any
         if n.startswith(("fine.", "coarse.")) and np.issubdtype(v.dtype, np.floating):
             blended[n] = (kept * np.asarray(before[n], np.float64) + (1.0 - kept) * v).astype(np.float32)
     return blended
-
-
-def judged_anew(weights: Arrays, rooms: Rooms, held: Rooms, folder: Path) -> dict[str, NDArray[Any]]:
-    """Return weights whose judge of things learned from the things that their networks make; parts stay in `folder`."""
-    learned, unseen = ([second_lessons(p, weights, folder, ENDS, few=few) for p, few in of] for of in (rooms, held))
-    last = [rows[-1] for rows in unseen]
-    return {**weights, **fit_things(weights, [x for rows in learned for x in rows], last)}
 
 
 def _write_state(arrays: Arrays, part: str, folder: Path) -> None:
