@@ -75,8 +75,6 @@ class FitSettings:
     least_weight: float = 0.0
     """What every border counts, however short it is, beside the logarithm of its length: legs are thin."""
     seed: int = 0
-    device: str | None = None
-    """Where it runs; None: the first GPU where there is one."""
     start: Path | None = None
     """Folder of an earlier fit to go on from, its learning rate a third."""
     blind: Blindness = field(default_factory=lambda: SEEING)
@@ -91,7 +89,7 @@ def fit(
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
-    device = torch.device(settings.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     rate = settings.rate
     if settings.start is None:
         _standardise(network, lessons, settings.blind)
