@@ -25,7 +25,7 @@ from list3r.instances.learned.kernels import seen_across
 from list3r.instances.learned.network import Classification, classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
-from list3r.instances.learned.weights import COMPUTED, SHIPPED, load_weights, write_weights
+from list3r.instances.learned.weights import COMPUTED, FORMAT, SHIPPED, load_weights
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings, SegmentSettings
 from list3r.memory.errors import OptionError
@@ -110,7 +110,7 @@ def test_the_network_says_the_same_in_numpy_and_torch() -> None:
 def test_weights_come_back_and_damage_is_said(tmp_path: Path) -> None:
     arrays = {"a.weight": np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4), "a.bias": np.ones(3, np.float32)}
     file = tmp_path / "w.npz"
-    write_weights(file, arrays)
+    FORMAT.write(file, arrays)
     back = load_weights(file)
     assert np.allclose(back["a.weight"], arrays["a.weight"], atol=1e-3) and back["a.weight"].dtype == np.float32
 

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
-from list3r.instances.learned.weights import load_weights, write_weights
+from list3r.instances.learned.weights import FORMAT, load_weights
 from training.fit import SEEING, WIDTH, FitSettings, fit
 from training.graphs import first_lesson, second_lessons
 from training.model import PieceNetwork
@@ -80,7 +80,7 @@ def main() -> None:
     rooms, left_out = ([(p, few) for p in of for few in (False, True)] for of in (paths, held))
     weights = args.weights or args.out / "weights.npz"
     train_further(rooms, left_out, args.out, args.epochs, weights, args.start)
-    write_weights(weights, mean_of(load_weights(args.start), load_weights(weights), args.kept))
+    FORMAT.write(weights, mean_of(load_weights(args.start), load_weights(weights), args.kept))
 
 
 def rooms_of(
@@ -111,7 +111,7 @@ def train_further(rooms: Rooms, held: Rooms, out: Path, epochs: int, weights: Pa
     second = fit(second_network(SEEING), [x for rows in every for x in rows], last, out / "coarse", settings)
     arrays |= named("coarse", second)
     arrays |= fit_things(arrays, [x for rows in every for x in rows], last)
-    write_weights(weights, arrays)
+    FORMAT.write(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, last)}))  # noqa: T201
 
 

@@ -28,7 +28,7 @@ def swept(film: Film, seed: int) -> Reconstruction | None:
     """Return the reconstruction of a film's pictures; None where there is too little depth to tell its noise."""
     given = reconstruction_of(film, drift_m=DRIFT_M, drift_deg=DRIFT_DEG, seed=seed)
     rng = np.random.default_rng([seed, 23])
-    sparse = [_known(true, rng) for true in film.true_depth]
+    sparse = [known_points(true, rng) for true in film.true_depth]
     frames = [Frame(k, float(t), film.color[k], None, None) for k, t in enumerate(film.time_s.tolist())]
     depth, confidence = dense_depth(PosedFrames(frames, given.posed, given.T_chunk_cam, given.camera, sparse))
     noise = stereo_noise(depth, confidence)
@@ -37,7 +37,8 @@ def swept(film: Film, seed: int) -> Reconstruction | None:
     return replace(given, depth=depth, confidence=confidence, depth_noise=noise)
 
 
-def _known(depth: np.ndarray, rng: np.random.Generator) -> Sparse:
+def known_points(depth: np.ndarray, rng: np.random.Generator) -> Sparse:
+    """Draw the triangulated points of a frame from its true depth (H, W)."""
     height, width = depth.shape
     y, x = (rng.integers(BORDER_PX, side - BORDER_PX, POINTS) for side in (height, width))
     known = (depth[y, x] > 0) & (depth[y, x] < FAR_M)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from list3r.instances.learned.cut import EXTRA_EDGES, EXTRA_NODES, CutSettings
 from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES
-from list3r.instances.learned.weights import write_weights
+from list3r.instances.learned.weights import FORMAT
 from training.fit import ABLATIONS, SEEING, WIDTH, Blindness, FitSettings, fit
 from training.graphs import Lesson, first_lesson, second_lessons
 from training.model import PieceNetwork
@@ -105,7 +105,7 @@ def train(
     )
     arrays |= named("coarse", network)
     arrays |= fit_things(arrays, [rows[k] for rows in every for k in (0, -2, -1)], unseen, blind=blind)
-    write_weights(weights, arrays)
+    FORMAT.write(weights, arrays)
     print(json.dumps({"weights": weights.name, "bytes": weights.stat().st_size, "held": things_found(arrays, unseen)}))  # noqa: T201
 
 

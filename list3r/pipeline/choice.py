@@ -181,7 +181,7 @@ def _local_features(words: str) -> tuple[str, str | None]:
 def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSelection:
     """Return the preset's models, or the classical ones, with what was asked for by name put in their place.
 
-    Raises `OptionError` where the weights of the learned discoverer are missing, damaged or of another version.
+    Raises `OptionError` where the weights of what learned are missing, damaged or of another version.
     """
     chosen = ModelSelection()
     if request.preset is not None:
@@ -203,6 +203,10 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
 
         for sensed in (True, False):
             load_weights(sensed=sensed)
+    if found.reconstruction == "sfm" or (found.reconstruction == "auto" and not info.has_depth):
+        from list3r.reconstruction.mvs.network import load_network
+
+        load_network()
     return found
 
 

@@ -15,6 +15,7 @@ from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import Stop
 from training.worlds.catalogue import BUILT_IN, KINDS
 from training.worlds.furnish import World, make_world
+from training.worlds.looks import exposed, with_looks
 from training.worlds.render import world_renderer
 from training.worlds.room import Placed, Room
 from training.worlds.sensors import HELD_OUT_SENSORS, SENSORS, depth_noise, drift_field, read
@@ -75,6 +76,8 @@ class FilmSettings:
     """From how far away things are looked at, at most; None: 2.4 m, and 3.4 m in rooms with what is built in."""
     patches: float = 0.0
     """Steps in computed depth where there is little texture, as a share of it."""
+    looks: bool = False
+    """Surfaces are worn, printed and glossy, and exposure changes, see `training.worlds.looks`."""
 
 
 def varied(settings: FilmSettings) -> FilmSettings:
@@ -118,6 +121,8 @@ def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
     time_s, poses = camera_path(visit.tour(stops), settings.frames, speed, settings.seed + visit.number)
     placed = tuple(p for t in world.things if (p := _shifted(t, visit)) is not None)
     renderer = world_renderer(placed, world.size, camera, settings.seed)
+    if settings.looks:
+        renderer = with_looks(renderer, settings.seed)
     color, depth, true_depth, ids = [], [], [], []
     drift = drift_field((h, w), rng)
     for pose in poses:
@@ -130,6 +135,8 @@ def make_film(settings: FilmSettings, visit: Visit | None = None) -> Film:
         ids.append(picture.ids.astype(np.uint16))
     things = tuple(_truth(t) for t in world.things)
     images = [np.stack(part) for part in (color, depth, true_depth, ids)]
+    if settings.looks:
+        images[0] = exposed(images[0], rng)
     return Film(camera, sensor, time_s, poses, images[0], images[1], images[2], images[3], things)
 
 

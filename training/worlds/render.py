@@ -70,14 +70,15 @@ class Caster:
             )
 
     def cast(self, origin: Floats, rays: Floats) -> tuple[Hits, NDArray[np.bool_], Floats]:
-        """Return hits, which rays hit, and lengths in units of the rays. Shapes (3,), (N, 3)."""
-        both = np.concatenate([np.broadcast_to(origin, rays.shape), rays], axis=1).astype(np.float32)
+        """Return hits, which rays hit, and lengths in units of the rays. Shapes (3,) or (N, 3), (N, 3)."""
+        start = np.broadcast_to(origin, rays.shape)
+        both = np.concatenate([start, rays], axis=1).astype(np.float32)
         answer = self._scene.cast_rays(self._o3d.core.Tensor(np.ascontiguousarray(both)), nthreads=1)
         length = answer["t_hit"].numpy()
         known = np.isfinite(length)
         normal = answer["primitive_normals"].numpy()[known]
         normal = normal * -np.sign((normal * rays[known]).sum(axis=1, keepdims=True))
-        points = (origin + rays[known] * length[known, None]).astype(np.float32)
+        points = (start[known] + rays[known] * length[known, None]).astype(np.float32)
         hits = Hits(
             answer["geometry_ids"].numpy()[known].astype(np.int64),
             answer["primitive_ids"].numpy()[known].astype(np.int64),
@@ -140,29 +141,22 @@ class Renderer:
     def __init__(
         self, caster: Caster, painter: Painter, owner: NDArray[np.int64], light: Light, camera: Camera
     ) -> None:
-        self._caster, self._painter, self._owner, self._light, self.camera = caster, painter, owner, light, camera
+        self.caster, self.painter, self.owner, self.light, self.camera = caster, painter, owner, light, camera
         u = (np.arange(camera.width) - camera.cx) / camera.fx
         v = (np.arange(camera.height) - camera.cy) / camera.fy
         x, y = np.meshgrid(u, v)
-        self._rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
+        self.rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
 
     def render(self, T_world_cam: NDArray[np.float64]) -> Picture:
         """Return what the camera at a pose (4, 4) sees."""
         shape = (self.camera.height, self.camera.width)
         origin = T_world_cam[:3, 3].astype(np.float32)
-        rays = self._rays @ T_world_cam[:3, :3].T.astype(np.float32)
-        hits, known, length = self._caster.cast(origin, rays)
-        albedo, failing = self._painter.color(hits)
-        to_lamp = self._light.position - hits.points
-        distance = np.linalg.norm(to_lamp, axis=1)
-        facing = np.clip((to_lamp * hits.normals).sum(axis=1) / np.maximum(distance, 1e-3), 0, 1)
-        lit = np.where(self._caster.shaded(hits.points, hits.normals, self._light.position), 0.0, facing)
-        shade = self._light.ambient * (0.8 + 0.2 * hits.normals[:, 2]) + self._light.strength * lit * 4.0 / (
-            2.0 + distance
-        )
+        rays = self.rays @ T_world_cam[:3, :3].T.astype(np.float32)
+        hits, known, length = self.caster.cast(origin, rays)
+        albedo, failing = self.painter.color(hits)
         out = {"color": np.zeros((len(known), 3), np.float32), "ids": np.zeros(len(known), np.int32)}
-        out["color"][known] = np.clip(albedo * shade[:, None].astype(np.float32) * self._light.tint, 0, 255)
-        out["ids"][known] = self._owner[hits.mesh]
+        out["color"][known] = np.clip(self.lit(albedo, hits), 0, 255)
+        out["ids"][known] = self.owner[hits.mesh]
         depth, cosine, glass = (np.zeros(len(known), np.float32) for _ in range(3))
         depth[known] = length[known]
         unit = rays[known] / np.linalg.norm(rays[known], axis=1, keepdims=True)
@@ -170,6 +164,17 @@ class Renderer:
         glass[known] = failing
         images = [a.reshape(shape) for a in (depth, out["ids"], cosine, glass)]
         return Picture(out["color"].reshape(*shape, 3), images[0], images[1], images[2], images[3])
+
+    def lit(self, albedo: Floats, hits: Hits, *, shadows: bool = True) -> Floats:
+        """Return colours (N, 3) as the light shows them."""
+        to_lamp = self.light.position - hits.points
+        distance = np.linalg.norm(to_lamp, axis=1)
+        direct = np.clip((to_lamp * hits.normals).sum(axis=1) / np.maximum(distance, 1e-3), 0, 1)
+        if shadows:
+            direct = np.where(self.caster.shaded(hits.points, hits.normals, self.light.position), 0.0, direct)
+        shade = self.light.ambient * (0.8 + 0.2 * hits.normals[:, 2])
+        shade = shade + self.light.strength * direct * 4.0 / (2.0 + distance)
+        return np.asarray(albedo * shade[:, None].astype(np.float32) * self.light.tint, np.float32)
 
 
 def world_renderer(things: Sequence[Placed], size: tuple[float, float, float], camera: Camera, seed: int) -> Renderer:

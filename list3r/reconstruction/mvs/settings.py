@@ -29,6 +29,8 @@ class SweepViewSettings:
     most_deg: float = 30.0
     least_overlap: float = 0.3
     """Share of the picture that a source must see."""
+    reach: tuple[float, float] = (0.6, 2.0)
+    """Depths are looked for from this share of the nearest triangulated points to so many times the farthest."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,19 @@ class MatchTrustSettings:
 
 
 @dataclass(frozen=True)
+class SweepNetworkSettings:
+    """What of the network's depth is taken where matches tell none (decision 0198)."""
+
+    most_error: float = 0.06
+    """Mean error that it expects, share of depth, above which it is left out."""
+    reach_px: int = 10
+    """Half the window, px at the refined width, in which there must be matches that it agrees with: in the middle of a
+    large blank or glossy surface nothing shows that it is right,"""
+    least_share: float = 0.08
+    """and the share of the window that they cover."""
+
+
+@dataclass(frozen=True)
 class MvsSettings:
     """Dense depth of a chunk."""
 
@@ -154,3 +169,5 @@ class MvsSettings:
     fusion: DepthFusionSettings = field(default_factory=DepthFusionSettings)
     fill: RegionFillSettings = field(default_factory=RegionFillSettings)
     trust: MatchTrustSettings = field(default_factory=MatchTrustSettings)
+    network: SweepNetworkSettings | None = field(default_factory=SweepNetworkSettings)
+    """None: by matches alone."""

@@ -1,8 +1,9 @@
 """Dense depth of a chunk of RGB frames whose poses are known: plane sweep, consistency, fusion.
 
-Keyframes are swept (`sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width. What
-other keyframes confirm is kept and fused (`fusion`), flat holes are filled and said to be unsure (`fill`), and every
-frame gets the depth of the keyframes around it. Depth without parallax or texture stays unknown (decision 0068).
+Keyframes are swept (`sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width; where
+that leaves doubt, a network reads the same costs and the picture (`network`). What other keyframes confirm is kept and
+fused (`fusion`), flat holes are filled and said to be unsure (`fill`), and every frame gets the depth of the keyframes
+around it. Depth without parallax, or with no texture near it, stays unknown (decisions 0068, 0198).
 """
 
 from __future__ import annotations
@@ -29,12 +30,21 @@ from list3r.reconstruction.mvs.fusion import (
     rims_out,
     speckles_out,
 )
-from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, make_pictures, sharpness
+from list3r.reconstruction.mvs.images import Pictures, Poses, Tensor, Warp, box_sum, make_pictures, sharpness
+from list3r.reconstruction.mvs.network import load_network, predict_depth, side_features
 from list3r.reconstruction.mvs.settings import (
     MatchTrustSettings,
     MvsSettings,
+    SweepNetworkSettings,
 )
-from list3r.reconstruction.mvs.sweep import CoarseDepth, DepthMatch, SweepReference, coarse_match, refine
+from list3r.reconstruction.mvs.sweep import (
+    CoarseDepth,
+    DepthMatch,
+    SweepReference,
+    coarse_match,
+    matching_cost,
+    refine,
+)
 from list3r.reconstruction.mvs.views import (
     ViewPairs,
     choose_carried,
@@ -46,7 +56,7 @@ from list3r.reconstruction.mvs.views import (
     seen_parts,
 )
 
-__all__ = ["MvsSettings", "PosedFrames", "Sparse", "dense_depth", "stereo_noise"]
+__all__ = ["KeyframeCosts", "MvsSettings", "PosedFrames", "Sparse", "dense_depth", "keyframe_costs", "stereo_noise"]
 
 Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Places (N, 2) in px and depths (N,) of a frame's triangulated points."""
@@ -56,6 +66,7 @@ Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
 class _Chunk:
     """What every step looks at."""
 
+    frames: Sequence[Frame]
     T_chunk_cam: Poses
     coarse: Pictures
     fine: Pictures
@@ -70,6 +81,31 @@ class _Chunk:
     sharp: NDArray[np.float64]
     device: str
     settings: MvsSettings
+
+
+@dataclass(frozen=True)
+class KeyframeCosts:
+    """How well each depth matches in a keyframe, at the coarse width."""
+
+    key: int
+    """Number of its frame."""
+    sources: list[int]
+    reference: SweepReference
+    planes: NDArray[np.float32]
+    """Inverse depths, evenly spaced. Shape (D,)."""
+    cost: Tensor
+    """In [0, 1]. Shape (D, h, w)."""
+    parallax_px: float
+    """How far one unit of inverse depth moves a pixel."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Least and greatest inverse depth."""
+        return float(self.planes[0]), float(self.planes[-1])
+
+    def side_features(self) -> NDArray[np.float32]:
+        """Return what the network sees beside costs and picture. Shape (3,)."""
+        return side_features(self.span, self.parallax_px, len(self.sources))
 
 
 @dataclass(frozen=True)
@@ -102,13 +138,22 @@ def dense_depth(
         chunk = _prepare(given, settings or MvsSettings(), device)
         if chunk is None:
             return depth, confidence
-        maps = {row: _filled(chunk, row, seen, frames) for row, seen in _keyframe_maps(chunk).items()}
+        maps = {row: _filled(chunk, row, seen) for row, seen in _keyframe_maps(chunk).items()}
         for position in np.flatnonzero(given.posed).tolist():
             small = _frame_map(chunk, maps, position)
             if small is None:
                 continue
             depth[position], confidence[position] = _full_size(chunk, small, frames[position], camera)
     return depth, confidence
+
+
+def keyframe_costs(given: PosedFrames, settings: MvsSettings | None = None, device: str = "cpu") -> list[KeyframeCosts]:
+    """Return the costs of the keyframes as `dense_depth` matches them, for what learns from them."""
+    with torch.inference_mode(), _one_thread():
+        chunk = _prepare(given, settings or MvsSettings(), device)
+        rows = range(0 if chunk is None else len(chunk.keyframes))
+        found = [_costs(chunk, row) for row in rows if chunk is not None]
+    return [swept for swept in found if swept is not None]
 
 
 @contextmanager
@@ -166,20 +211,20 @@ def _prepare(given: PosedFrames, settings: MvsSettings, device: str) -> _Chunk |
     coarse = make_pictures(frames, camera, min(settings.sweep.coarse_width_px, camera.width), device)
     fine = make_pictures(frames, camera, min(settings.sweep.width_px, camera.width), device)
     sharp = np.array([sharpness(gray) for gray in fine.gray.cpu().numpy()])
-    known = _sparse_depth(sparse, len(frames))
+    known = _sparse_depth(sparse, len(frames), settings.views.reach)
     if known is None:
-        known = _probe(posed, T, coarse, sharp, settings, device)
+        known = _probe(given, T, coarse, sharp, settings, device)
     if known is None:
         return None
     depth, span = known
     keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
     pairs = pair_views(keyframes, posed, T, fine.camera, depth)
     parts = seen_parts(keyframes, posed, T, fine.camera, depth)
-    return _Chunk(T, coarse, fine, keyframes, pairs, parts, depth, span, sharp, device, settings)
+    return _Chunk(frames, T, coarse, fine, keyframes, pairs, parts, depth, span, sharp, device, settings)
 
 
 def _sparse_depth(
-    sparse: Sequence[Sparse | None] | None, count: int
+    sparse: Sequence[Sparse | None] | None, count: int, reach: tuple[float, float]
 ) -> tuple[NDArray[np.float64], tuple[float, float]] | None:
     """Typical depth of each frame and the span of depths, from triangulated points."""
     if sparse is None:
@@ -191,11 +236,11 @@ def _sparse_depth(
     typical = float(np.median(joined))
     depth = np.array([float(np.median(d)) if len(d) >= 10 else typical for d in each])
     low, high = np.quantile(joined, [0.01, 0.99])
-    return depth, (0.6 * float(low), 2.0 * float(high))
+    return depth, (reach[0] * float(low), reach[1] * float(high))
 
 
 def _probe(
-    posed: NDArray[np.bool_],
+    given: PosedFrames,
     T: Poses,
     coarse: Pictures,
     sharp: NDArray[np.float64],
@@ -203,6 +248,7 @@ def _probe(
     device: str,
 ) -> tuple[NDArray[np.float64], tuple[float, float]] | None:
     """Typical depth without triangulated points: a few keyframes are swept from very near to very far, twice."""
+    posed = given.posed
     centers = T[posed, :3, 3]
     reach = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     if reach < 1e-9:
@@ -213,9 +259,8 @@ def _probe(
         keyframes = choose_keyframes(posed, T, depth, sharp, settings.views)
         keyframes = keyframes[:: max(1, len(keyframes) // 4)]
         pairs = pair_views(keyframes, posed, T, coarse.camera, depth)
-        chunk = _Chunk(
-            T, coarse, coarse, keyframes, pairs, np.zeros((0, 0, 0), bool), depth, span, sharp, device, settings
-        )
+        parts = np.zeros((0, 0, 0), bool)
+        chunk = _Chunk(given.frames, T, coarse, coarse, keyframes, pairs, parts, depth, span, sharp, device, settings)
         found = [d for d in (_probed(chunk, row) for row in range(len(keyframes))) if len(d)]
         if not found:
             return None
@@ -228,31 +273,33 @@ def _probe(
 
 def _probed(chunk: _Chunk, row: int) -> NDArray[np.float64]:
     """Depths of the pixels of a keyframe that leave no doubt."""
-    swept = _coarse(chunk, row)
+    swept = _costs(chunk, row)
     if swept is None:
         return np.zeros(0)
-    found, _ = swept
+    found = _coarse(chunk, swept)
     return (1.0 / found.inverse[found.margin > chunk.settings.trust.sure_margin]).cpu().numpy().astype(np.float64)
 
 
-def _coarse(chunk: _Chunk, row: int) -> tuple[CoarseDepth, list[int]] | None:
-    """Depth at the coarse width and the sources; None without parallax."""
+def _costs(chunk: _Chunk, row: int) -> KeyframeCosts | None:
+    """Match a keyframe at the coarse width with its sources; None without parallax."""
     settings, key = chunk.settings.sweep, chunk.keyframes[row]
     sources = choose_sources(row, chunk.pairs, chunk.T_chunk_cam, chunk.sharp, key, chunk.settings.views)
     if not sources:
         return None
     parallax = _parallax_px(chunk, row, sources, chunk.coarse.camera)
     planes = plane_depths(*chunk.span, parallax, 24, settings.planes)
-    spacing = float(planes[1] - planes[0])
     reference = SweepReference.of(chunk.coarse.gray[key], settings.radius_px, settings.image_noise)
-    place, margin = coarse_match(
-        reference,
-        [chunk.coarse.gray[k] for k in sources],
-        _warps(chunk, key, sources, chunk.coarse.camera),
-        torch.from_numpy(planes).to(chunk.device),
-        settings,
-    )
-    return CoarseDepth(float(planes[0]) + place * spacing, margin, spacing), sources
+    inverse = torch.from_numpy(planes).to(chunk.device)[:, None, None]
+    others, warps = [chunk.coarse.gray[k] for k in sources], _warps(chunk, key, sources, chunk.coarse.camera)
+    cost = matching_cost(reference, others, warps, inverse, settings)
+    return KeyframeCosts(key, sources, reference, planes, cost, parallax)
+
+
+def _coarse(chunk: _Chunk, swept: KeyframeCosts) -> CoarseDepth:
+    """Depth at the coarse width."""
+    spacing = float(swept.planes[1] - swept.planes[0])
+    place, margin = coarse_match(swept.reference, swept.cost, chunk.settings.sweep)
+    return CoarseDepth(float(swept.planes[0]) + place * spacing, margin, spacing)
 
 
 def _parallax_px(chunk: _Chunk, row: int, sources: list[int], camera: Camera) -> float:
@@ -267,19 +314,43 @@ def _warps(chunk: _Chunk, key: int, others: Sequence[int], camera: Camera) -> li
 
 
 def _sweep(chunk: _Chunk, row: int) -> SweptDepth | None:
-    """Return a keyframe's own depth, None without parallax."""
-    swept = _coarse(chunk, row)
+    """Return a keyframe's own depth by matches, and by the network where they tell none; None without parallax."""
+    swept = _costs(chunk, row)
     if swept is None:
         return None
-    coarse, sources = swept
-    settings, trust, key = chunk.settings.sweep, chunk.settings.trust, chunk.keyframes[row]
-    gray = chunk.fine.gray[key]
+    match = _matched(chunk, row, swept)
+    if chunk.settings.network is None:
+        return match
+    told = _predicted(chunk, swept, match, chunk.settings.network)
+    return SweptDepth(
+        torch.where(match.known, match.inverse, told.inverse),
+        torch.where(match.known, match.sigma, told.sigma),
+        match.known | told.known,
+    )
+
+
+def _matched(chunk: _Chunk, row: int, swept: KeyframeCosts) -> SweptDepth:
+    """Return depth by matches alone."""
+    settings, trust, sources = chunk.settings.sweep, chunk.settings.trust, swept.sources
+    gray, coarse = chunk.fine.gray[swept.key], _coarse(chunk, swept)
     start = CoarseDepth(_resized(coarse.inverse, gray.shape), _resized(coarse.margin, gray.shape), coarse.spacing)
     reference = SweepReference.of(gray, settings.radius_px, settings.image_noise)
-    warps = _warps(chunk, key, sources, chunk.fine.camera)
+    warps = _warps(chunk, swept.key, sources, chunk.fine.camera)
     match = refine(reference, [chunk.fine.gray[k] for k in sources], warps, start, settings)
     known = (match.cost < trust.most_cost) & (match.margin > trust.least_margin) & (match.texture > trust.least_texture)
     return SweptDepth(match.inverse_depth, _match_sigma(chunk, row, sources, match), known & ~match.doubt)
+
+
+def _predicted(chunk: _Chunk, swept: KeyframeCosts, match: SweptDepth, settings: SweepNetworkSettings) -> SweptDepth:
+    """Return the depth that the network reads from costs and picture, near matches that it agrees with."""
+    network, color = load_network(device=chunk.device), chunk.frames[swept.key].color
+    inverse, error = predict_depth(network, swept.cost, color, swept.span, swept.side_features())
+    inverse, error = _resized(inverse, match.inverse.shape), _resized(error, match.inverse.shape)
+    sigma = 2.0**0.5 * error * inverse
+    apart = (match.inverse - inverse).abs()
+    agrees = match.known & (apart < chunk.settings.fusion.gate * torch.sqrt(sigma**2 + match.sigma**2))
+    share = box_sum(agrees.float(), settings.reach_px) / (2 * settings.reach_px + 1) ** 2
+    return SweptDepth(inverse, sigma, (error < settings.most_error) & (share > settings.least_share))
 
 
 def _match_sigma(chunk: _Chunk, row: int, sources: list[int], match: DepthMatch) -> Tensor:
@@ -309,10 +380,10 @@ def _keyframe_maps(chunk: _Chunk) -> dict[int, DepthMap]:
     return out
 
 
-def _filled(chunk: _Chunk, row: int, depth: DepthMap, frames: Sequence[Frame]) -> DepthMap:
+def _filled(chunk: _Chunk, row: int, depth: DepthMap) -> DepthMap:
     """Return a keyframe's depth with its flat regions without texture filled."""
     height, width = depth.inverse.shape
-    color = cv2.resize(frames[chunk.keyframes[row]].color, (width, height), interpolation=cv2.INTER_AREA)
+    color = cv2.resize(chunk.frames[chunk.keyframes[row]].color, (width, height), interpolation=cv2.INTER_AREA)
     small = fill_flat(depth, chunk.settings.fusion)
     inverse, sigma = small.inverse.cpu().numpy(), small.sigma.cpu().numpy()
     inverse, sigma = fill_regions(inverse, sigma, np.asarray(color, np.uint8), chunk.settings.fill)

@@ -171,13 +171,10 @@ def _below_planes_of_tensors(cost: Tensor) -> tuple[Tensor, Tensor]:
     return best[0] + offset, best[0]
 
 
-def coarse_match(
-    reference: SweepReference, sources: Sequence[Tensor], warps: Sequence[Warp], planes: Tensor, settings: SweepSettings
-) -> tuple[Tensor, Tensor]:
-    """Plane number (with a fraction) of each pixel and the margin of the choice. Shape (h, w) each."""
-    cost = matching_cost(reference, sources, warps, planes[:, None, None], settings)
+def coarse_match(reference: SweepReference, cost: Tensor, settings: SweepSettings) -> tuple[Tensor, Tensor]:
+    """Plane number (with a fraction) of each pixel by costs (D, h, w), and the margin of the choice. Shape (h, w)."""
     place, plane = below_planes(aggregate(cost, reference.gray, settings))
-    number = torch.arange(len(planes), device=cost.device)[:, None, None]
+    number = torch.arange(len(cost), device=cost.device)[:, None, None]
     other = torch.where((number - plane).abs() <= 2, torch.full((), 1.0, device=cost.device), cost).amin(dim=0)
     return place, other - cost.gather(0, plane[None])[0]
 
