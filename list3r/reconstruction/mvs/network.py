@@ -91,11 +91,11 @@ class SweepNetwork(nn.Module):
 
 
 def _mode(logits: Tensor) -> Tensor:
-    """Return the mean place around the likeliest plane. Shape (B, h, w)."""
-    p, best = logits.softmax(1), logits.argmax(1, keepdim=True)
-    n = torch.arange(PLANES, device=logits.device, dtype=torch.float32)[None, :, None, None]
-    near = p * ((n - best).abs() <= 2.5)
-    return (near * n).sum(1) / near.sum(1).clamp_min(1e-6)
+    """Return the mean place of the likeliest plane and two on either side. Shape (B, h, w)."""
+    near = logits.argmax(1, keepdim=True) + torch.arange(-2, 3, device=logits.device)[None, :, None, None]
+    there = logits.gather(1, near.clamp(0, PLANES - 1))
+    share = there.masked_fill((near < 0) | (near >= PLANES), -torch.inf).softmax(1)
+    return (share * near).sum(1)
 
 
 def _convex(place: Tensor, weights: Tensor) -> Tensor:
@@ -135,7 +135,7 @@ def load_network(path: Path | None = None, device: str = "cpu") -> SweepNetwork:
     arrays = FORMAT.read(path or SHIPPED, fix)
     network = SweepNetwork()
     network.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    return network.eval().requires_grad_(False).to(device)
+    return network.eval().requires_grad_(False).to(device, memory_format=torch.channels_last)
 
 
 def predict_depth(
@@ -147,9 +147,9 @@ def predict_depth(
     """
     low, high = span
     picture = torch.from_numpy(network_picture(color, *cost.shape[1:])).to(cost.device)
-    likeness = 1.0 - 2.0 * network_costs(cost)
-    given = picture.permute(2, 0, 1).float() / 127.5 - 1.0
+    likeness = (1.0 - 2.0 * network_costs(cost))[None].contiguous(memory_format=torch.channels_last)
+    given = (picture.permute(2, 0, 1).float() / 127.5 - 1.0)[None]  # in the memory's order already
     with torch.inference_mode():
-        said = network(likeness[None], given[None], torch.from_numpy(side)[None].to(cost.device))
+        said = network(likeness, given, torch.from_numpy(side)[None].to(cost.device))
     inverse = low + said.place[0] * ((high - low) / (PLANES - 1))
     return inverse.clamp_min(1e-3 * high), said.log_error[0].exp()
