@@ -183,7 +183,7 @@ def discovery() -> str:
     """
     methods = {"geometric": "rules (removed since)", "learned": "learned (default)", "true": "true masks"}
     methods["before"] = "learned, with the weights before decision 0179"
-    methods["before 0186"] = "learned, with the weights before decision 0186"
+    methods["before 0199"] = "learned, depth by matches alone, before decision 0199"
     places = {
         "discovery": "10 held-out worlds",
         "discovery-fitted": "6 held-out rooms with built-in furniture",

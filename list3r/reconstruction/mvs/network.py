@@ -135,7 +135,7 @@ def load_network(path: Path | None = None, device: str = "cpu") -> SweepNetwork:
     arrays = FORMAT.read(path or SHIPPED, fix)
     network = SweepNetwork()
     network.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    return network.eval().requires_grad_(False).to(device, memory_format=torch.channels_last)
+    return network.eval().requires_grad_(False).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
 def predict_depth(
