@@ -4,7 +4,7 @@ python -m training.sweep --out DIR --rooms 1140 --workers 14
 
 Rooms are filmed and swept first, each kept in the folder; then the network learns from them, on a GPU where there is
 one. On processors alone take `--steps 4000 --start list3r/reconstruction/mvs/weights.npz`, which goes on from the
-shipped network: from nothing so many steps would take 30 hours of two cores. Both are gone on with when interrupted.
+shipped network: from nothing, so many steps of 40 would take days of two cores. Both are gone on with when interrupted.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Keyframes are swept (`sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width; where
 that leaves doubt, a network reads the same costs and the picture (`network`). What other keyframes confirm is kept and
 fused (`fusion`), flat holes are filled and said to be unsure (`fill`), and every frame gets the depth of the keyframes
-around it. Depth without parallax, or with no texture near it, stays unknown (decisions 0068, 0198).
+around it. Depth without parallax, or with no texture near it, stays unknown (decisions 0068, 0199).
 """
 
 from __future__ import annotations
