@@ -1,4 +1,4 @@
-"""The plane sweep's network: it adds depth where matches tell none, and never without them."""
+"""The plane sweep's network: it adds depth where matches tell none, and is about as right."""
 
 from __future__ import annotations
 

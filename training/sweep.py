@@ -42,10 +42,16 @@ def main() -> None:
     tasks += [(FIRST_HELD_SEED + k, Kind(held_out=True)) for k in range(args.held)]
     tasks += [(FIRST_FITTED_HELD_SEED + k, Kind(held_out=True, fitted=True)) for k in range(args.held)]
     with ProcessPoolExecutor(args.workers, get_context("spawn")) as pool:
-        made = list(pool.map(partial(_make, args.out / "keyframes"), tasks))
+        made = []
+        for path in pool.map(partial(_make, args.out / "keyframes"), tasks):
+            made.append(path)
+            if len(made) % 20 == 0 or len(made) == len(tasks):
+                print(json.dumps({"rooms": len(made), "of": len(tasks)}), flush=True)  # noqa: T201
     found = [(path, kind) for path, (_, kind) in zip(made, tasks, strict=True) if path is not None]
     rooms = [path for path, kind in found if not kind.get("held_out")]
     held = [path for path, kind in found if kind.get("held_out")]
+    if not rooms:
+        parser.error("there is no room to learn from; give --rooms")
     network = SweepNetwork() if args.start is None else load_network(args.start)
     network.requires_grad_(True)
     gpu = torch.cuda.is_available()

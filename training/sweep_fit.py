@@ -92,7 +92,7 @@ def fit_sweep(
             told = dict(
                 zip(
                     ("planes", "error", "place"),
-                    torch.stack(losses).mean(0).cpu().numpy().round(4).tolist(),
+                    torch.stack(losses).double().mean(0).cpu().numpy().round(4).tolist(),
                     strict=True,
                 )
             )
@@ -175,6 +175,8 @@ def relative_error(said: SweepPrediction, batch: Batch) -> Tensor:
 
 def judge_sweep(network: SweepNetwork, rooms: Sequence[Path]) -> dict[str, list[float]]:
     """Return median error of depth and shares off by 5 and by 10 percent, among so many of the surest pixels."""
+    if not rooms:
+        return {}
     errors, said_errors = [], []
     settings, device = SweepFitSettings(batch=1), next(network.parameters()).device
     network.eval()

@@ -11,13 +11,12 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import Frame
 from list3r.reconstruction.mvs.network import PLANES, network_costs, network_picture
 from list3r.reconstruction.mvs.settings import MvsSettings
-from list3r.reconstruction.mvs.stereo import KeyframeCosts, PosedFrames, keyframe_costs
+from list3r.reconstruction.mvs.stereo import KeyframeCosts, keyframe_costs
 from training.samples import Kind, chunk_file
-from training.swept import DRIFT_DEG, DRIFT_M, known_points
-from training.worlds.film import Film, FilmSettings, make_film, reconstruction_of, varied
+from training.swept import posed_film
+from training.worlds.film import Film, FilmSettings, make_film, varied
 
 PARTS = ("costs", "picture", "place", "side")
 """Arrays of a room with K keyframes: uint8 (K, 64, h, w), 255 for cost 1; RGB (K, 2h, 2w, 3); true place among the
@@ -44,7 +43,7 @@ def make_keyframes(seed: int, folder: Path, **kind: Unpack[Kind]) -> Path | None
     rows = _keyframes(film, seed, rng if learned else None)
     kept = [rows[k] for k in sorted(rng.permutation(len(rows))[:MOST_KEYFRAMES].tolist())]
     fresh = path.with_name(f"{path.name}.{os.getpid()}")
-    fresh.mkdir(parents=True)
+    fresh.mkdir(parents=True, exist_ok=True)
     for name, images in zip(PARTS, zip(*kept, strict=True), strict=False):
         np.save(fresh / f"{name}.npy", np.stack(images))
     if path.exists():
@@ -56,11 +55,7 @@ def make_keyframes(seed: int, folder: Path, **kind: Unpack[Kind]) -> Path | None
 
 def _keyframes(film: Film, seed: int, vary: np.random.Generator | None) -> list[tuple[NDArray[np.generic], ...]]:
     drift = 1.0 if vary is None else float(np.exp(vary.normal(0.3, 0.7)))
-    given = reconstruction_of(film, drift_m=DRIFT_M * drift, drift_deg=DRIFT_DEG * drift, seed=seed)
-    rng = np.random.default_rng([seed, 23])
-    sparse = [known_points(true, rng) for true in film.true_depth]
-    frames = [Frame(k, float(t), film.color[k], None, None) for k, t in enumerate(film.time_s.tolist())]
-    posed = PosedFrames(frames, given.posed, given.T_chunk_cam, given.camera, sparse)
+    _, posed = posed_film(film, seed, drift)
     return [_sample(film, swept) for swept in keyframe_costs(posed, _settings(vary))]
 
 
@@ -77,7 +72,7 @@ def _settings(vary: np.random.Generator | None) -> MvsSettings:
 
 
 def _sample(film: Film, swept: KeyframeCosts) -> tuple[NDArray[np.generic], ...]:
-    costs = (network_costs(swept.cost) * 255.0).round().to(dtype=swept.cost.dtype).numpy().astype(np.uint8)
+    costs = (network_costs(swept.cost) * 255.0).round().numpy().astype(np.uint8)
     picture = network_picture(film.color[swept.key], *costs.shape[1:])
     (low, high), true = swept.span, film.true_depth[swept.key]
     place = (1.0 / np.maximum(true, 1e-3) - low) / (high - low) * (PLANES - 1)

@@ -26,19 +26,24 @@ POINTS, BORDER_PX, FAR_M = 120, 4, 8.0
 
 def swept(film: Film, seed: int) -> Reconstruction | None:
     """Return the reconstruction of a film's pictures; None where there is too little depth to tell its noise."""
-    given = reconstruction_of(film, drift_m=DRIFT_M, drift_deg=DRIFT_DEG, seed=seed)
-    rng = np.random.default_rng([seed, 23])
-    sparse = [known_points(true, rng) for true in film.true_depth]
-    frames = [Frame(k, float(t), film.color[k], None, None) for k, t in enumerate(film.time_s.tolist())]
-    depth, confidence = dense_depth(PosedFrames(frames, given.posed, given.T_chunk_cam, given.camera, sparse))
+    given, posed = posed_film(film, seed)
+    depth, confidence = dense_depth(posed)
     noise = stereo_noise(depth, confidence)
     if noise is None:
         return None
     return replace(given, depth=depth, confidence=confidence, depth_noise=noise)
 
 
-def known_points(depth: np.ndarray, rng: np.random.Generator) -> Sparse:
-    """Draw the triangulated points of a frame from its true depth (H, W)."""
+def posed_film(film: Film, seed: int, drift: float = 1.0) -> tuple[Reconstruction, PosedFrames]:
+    """Return the poses of a film, off by `drift` times the usual, and its pictures with them."""
+    given = reconstruction_of(film, drift_m=DRIFT_M * drift, drift_deg=DRIFT_DEG * drift, seed=seed)
+    rng = np.random.default_rng([seed, 23])
+    sparse = [_known(true, rng) for true in film.true_depth]
+    frames = [Frame(k, float(t), film.color[k], None, None) for k, t in enumerate(film.time_s.tolist())]
+    return given, PosedFrames(frames, given.posed, given.T_chunk_cam, given.camera, sparse)
+
+
+def _known(depth: np.ndarray, rng: np.random.Generator) -> Sparse:
     height, width = depth.shape
     y, x = (rng.integers(BORDER_PX, side - BORDER_PX, POINTS) for side in (height, width))
     known = (depth[y, x] > 0) & (depth[y, x] < FAR_M)
