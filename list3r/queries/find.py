@@ -20,6 +20,8 @@ from list3r.queries.views.gather import Gathered, gather, is_large
 
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
+_NAMED_EVERY = 4
+"""Of the sample of a large memory, each so many tell what most things are called."""
 _ALIKE = 0.1
 """Sizes that differ by less than this share are equally the biggest."""
 
@@ -156,7 +158,8 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
         if by_vector is not None:
             return by_vector
         search.unknown += unknown
-        named = search.things.values() if search.gathered is None else search.store.instances.of(search.gathered.sample)
+        few = [] if search.gathered is None else search.store.instances.of(search.gathered.sample[::_NAMED_EVERY])
+        named = search.things.values() if search.gathered is None else few
         search.notes.append(no_such_words(unknown, named))
         return []
     structure = not STRUCTURE.isdisjoint(phrase.words) or bool(

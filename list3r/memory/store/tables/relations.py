@@ -5,11 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from list3r.memory.records import Relation
 from list3r.memory.store.connection import Connection
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.rows.columns import Columns
 from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.ids import Ids
+
+_KEPT_BYTES = 8_000_000
+"""Of relations of many instances that were asked for last."""
 
 
 class RelationTable:
@@ -21,6 +28,9 @@ class RelationTable:
         order, columns = "subject, predicate, object", Columns.of(Relation)
         self._rows = Table(connection, "relations", columns, order, checked=True)
         self._unchecked = Table(connection, "relations", columns, order)
+        self._kept = _kept()
+        self._kept_of: object = None
+        """State of the file in which they were read."""
 
     def replace(self, subjects: Iterable[int] | None, relations: Iterable[Relation]) -> None:
         """Replace all relations that touch these instances (all relations when `subjects` is None)."""
@@ -58,14 +68,36 @@ class RelationTable:
         What leads to an answer: in a table that is not checked as a whole these rows are not, `among` checks those of
         the answer.
         """
-        ends = {c: sorted(map(int, ids)) for c, ids in (("subject", subjects), ("object", objects)) if ids is not None}
+        given = (("subject", subjects), ("object", objects))
+        ends = {column: np.sort(np.fromiter(ids, np.int64)) for column, ids in given if ids is not None}
         first, *other = sorted(ends, key=lambda column: len(ends[column]))
-        among = "IN (SELECT value FROM json_each(?))"
-        where = f"{first} {among} AND predicate IN ({','.join('?' * len(predicates))})"
-        where += "".join(f" AND +{column} {among}" for column in other)
-        arguments = (json.dumps(ends[first]), *predicates, *(json.dumps(ends[column]) for column in other))
-        return self._connection.rows(f"SELECT subject, object FROM relations WHERE {where}", arguments)
+        found = self._pairs_of(first, json.dumps(ends[first].tolist()), tuple(predicates))
+        for column in other:
+            found = found[np.isin(found[:, ("subject", "object").index(column)], ends[column])]
+        return list(zip(*found.T.tolist(), strict=True))
+
+    def _pairs_of(self, column: str, ids: str, predicates: tuple[str, ...]) -> NDArray[np.int64]:
+        """Return what `pairs` does for one end, whose `ids` are a list in JSON; kept while the file stays as it is.
+
+        An id has few relations: reading them all costs less than looking each predicate up. Shape (N, 2).
+        """
+        state = self._connection.stamp()
+        if state != self._kept_of:
+            self._kept, self._kept_of = _kept(), state
+        kept = self._kept.get((column, ids, predicates))
+        if kept is None:
+            query = (
+                f"SELECT subject, object FROM relations WHERE {column} IN (SELECT value FROM json_each(?))"
+                f" AND +predicate IN ({','.join('?' * len(predicates))})"
+            )
+            rows = self._connection.rows(query, (ids, *predicates))
+            kept = self._kept.put((column, ids, predicates), np.array(rows, np.int64).reshape(-1, 2))
+        return kept
 
     def drop(self, instance_id: int) -> None:
         """Forget the relations of an instance."""
         self._rows.delete("subject = ? OR object = ?", (instance_id, instance_id))
+
+
+def _kept() -> LruCache[tuple[str, str, tuple[str, ...]], NDArray[np.int64]]:
+    return LruCache(_KEPT_BYTES, lambda pairs: pairs.nbytes)
