@@ -14,7 +14,6 @@ from list3r.memory.errors import OptionError
 from list3r.pipeline.choice import BuildRequest, settings_asked
 from list3r.reconstruction.mvs.network import (
     PLANES,
-    SHIPPED,
     SweepNetwork,
     load_network,
     network_costs,
@@ -22,6 +21,7 @@ from list3r.reconstruction.mvs.network import (
     side_features,
 )
 from list3r.reconstruction.mvs.stereo import MvsSettings, PosedFrames, dense_depth, keyframe_costs
+from list3r.reconstruction.mvs.weights import SHIPPED
 from tests.test_mvs import COUNT, SMALL, errors, small_scene
 
 
@@ -73,7 +73,7 @@ def test_shipped_weights_are_small_and_damage_is_said(tmp_path: Path, monkeypatc
     assert {k: v.shape for k, v in fresh.items()} == {k: v.shape for k, v in shipped.items()}
     (tmp_path / "weights.npz").write_bytes(SHIPPED.read_bytes()[:-2000])
     load_network.cache_clear()
-    monkeypatch.setattr("list3r.reconstruction.mvs.network.SHIPPED", tmp_path / "weights.npz")
+    monkeypatch.setattr("list3r.reconstruction.mvs.weights.SHIPPED", tmp_path / "weights.npz")
     colour = SourceInfo("folder", "walk", 9, 30.0, None, False, False, "relative", "x")
     with pytest.raises(OptionError, match=r"network in weights\.npz .*install list3r again") as said:
         settings_asked(BuildRequest(), colour, "any")

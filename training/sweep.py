@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from list3r.reconstruction.mvs.network import FORMAT, SweepNetwork, load_network
+from list3r.reconstruction.mvs.network import SweepNetwork, load_network
+from list3r.reconstruction.mvs.weights import FORMAT
 from training.samples import Kind
 from training.sweep_fit import SweepFitSettings, fit_sweep, judge_sweep
 from training.sweep_samples import make_keyframes

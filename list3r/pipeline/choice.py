@@ -204,9 +204,9 @@ def _selection(request: BuildRequest, info: SourceInfo, licence: str) -> ModelSe
         for sensed in (True, False):
             load_weights(sensed=sensed)
     if found.reconstruction == "sfm" or (found.reconstruction == "auto" and not info.has_depth):
-        from list3r.reconstruction.mvs.network import load_network
+        from list3r.reconstruction.mvs.weights import read_weights
 
-        load_network()
+        read_weights()
     return found
 
 

@@ -34,7 +34,14 @@ from list3r.pipeline.choice import (
     settings_resumed,
     stored_sessions,
 )
-from list3r.pipeline.chunks.calibration import camera_notes, estimated_camera, with_camera, with_short_windows
+from list3r.pipeline.chunks.calibration import (
+    camera_notes,
+    estimated_camera,
+    get_ready_for_camera,
+    is_camera_wanted,
+    with_camera,
+    with_short_windows,
+)
 from list3r.pipeline.chunks.chunk import ChunkTask, get_ready, process_parts
 from list3r.pipeline.chunks.joint_windows import ChunkPool, joint_windows
 from list3r.pipeline.chunks.whole_map import map_spans, map_whole, takes_wide_steps
@@ -184,6 +191,8 @@ def _camera_and_map(
     not known of a camera whose focal length is given.
     """
     given = job.info.camera is not None
+    if wide and isinstance(pool, OrderedPool):
+        pool.start(get_ready, job.settings)
     whole = map_whole(job.frames(), job.settings) if wide and given else None
     how = with_short_windows(job.settings) if wide else job.settings
     estimate = partial(estimated_camera, job.frames(), job.options, how, watch.look, whole, pool)
@@ -248,7 +257,8 @@ def chunk_pool(job: Job) -> ChunkPool:
     chunks = min(settings.chunks, settings.video_map.chunks, key=lambda c: c.length - c.overlap)
     most = len(plan_chunks(job.info.frame_count, chunks))
     pool = OrderedPool(process_parts, min(usual_workers(settings) if asked is None else asked, most))
-    pool.start(get_ready, settings)
+    camera_first = is_camera_wanted(job.info, job.options, settings)
+    pool.start(get_ready_for_camera if camera_first else get_ready, settings)
     return pool
 
 

@@ -208,10 +208,8 @@ MOST_IN_TABLE = 10_000
 def _codes(cloud: Cloud, labels: NDArray[np.int32], meets: _Touching, count: int, doublings: int) -> NDArray[np.int64]:
     """Codes of pieces that touch or come near each other, ascending. Shape (E,)."""
     if count > MOST_IN_TABLE:
-        found = np.unique(meets.code)
-        for codes in _near_codes(cloud, labels, count, doublings):
-            found = np.union1d(found, codes)
-        return found
+        found = np.sort(np.concatenate([meets.code, *_near_codes(cloud, labels, count, doublings)]))
+        return np.asarray(found[np.diff(found, prepend=-1) != 0])
     table = np.zeros(-(-count * count // 8) * 8, bool)
     table[meets.code] = True
     for codes in _near_codes(cloud, labels, count, doublings):

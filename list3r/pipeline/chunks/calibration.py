@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import Camera, FrameSource
+from list3r.frames.base import Camera, FrameSource, SourceInfo
 from list3r.frames.options import SourceOptions
 from list3r.memory.records import SessionCamera
 from list3r.memory.store.store import Store
-from list3r.pipeline.chunks.chunk import open_once
+from list3r.pipeline.chunks.chunk import get_ready, open_once
 from list3r.pipeline.settings import BuildSettings
+from list3r.pipeline.workers import OrderedPool
 from list3r.reconstruction.registry import entry
 
 if TYPE_CHECKING:
@@ -55,10 +57,9 @@ def estimated_camera(
     `look` hears ("camera", windows of the video done, in all). Where the focal length is given and the `whole` video
     is mapped, that map tells the rest. Windows are mapped by the processes of a `pool` where there is one.
     """
-    name, info = entry(settings.reconstruction).calibration, source.info
-    distortion_known = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
-    if not name or (info.camera is not None and distortion_known):
+    if not is_camera_wanted(source.info, options, settings):
         return None
+    name, info = entry(settings.reconstruction).calibration, source.info
     with threadpool_limits(1):
         progress = None if look is None else (lambda done, total: look("camera", done, total))
         module = import_module(f"list3r.reconstruction.{name}")
@@ -75,6 +76,12 @@ def estimated_camera(
     return SessionCamera((full.fx, full.fy, full.cx, full.cy), tuple(found.camera.distortion), tuple(found.notes))
 
 
+def is_camera_wanted(info: SourceInfo, options: SourceOptions, settings: BuildSettings) -> bool:
+    """Tell whether the model asks for more of the camera than the source says."""
+    distortion_known = options.distortion is not None or info.kind not in _SILENT_ON_DISTORTION
+    return bool(entry(settings.reconstruction).calibration) and not (info.camera is not None and distortion_known)
+
+
 @dataclass(frozen=True)
 class CameraWindow:
     """A stretch of a video by which its camera is estimated."""
@@ -88,16 +95,23 @@ class CameraWindow:
     """The camera that its map begins with."""
 
 
+def get_ready_for_camera(settings: BuildSettings) -> ModuleType:
+    """Import what windows need, which takes less time than what chunks do."""
+    return import_module(f"list3r.reconstruction.{entry(settings.reconstruction).calibration}")
+
+
 def map_camera_window(window: CameraWindow) -> Any:
     """Return what the model's module makes of one window."""
-    module = import_module(f"list3r.reconstruction.{entry(window.settings.reconstruction).calibration}")
+    module = get_ready_for_camera(window.settings)
     source = open_once(window.path, window.options)
     return module.map_window(source, *window.span, window.start, window.settings.models.sfm)
 
 
 def _mapped(pool: ChunkPool, first: CameraWindow, spans: Sequence[tuple[int, int]], start: Camera) -> Iterable[Any]:
-    """Map some windows in the processes of a pool, in order."""
-    return pool.each(map_camera_window, (replace(first, span=span, start=start) for span in spans))
+    """Map some windows in the processes of a pool, in order. The processes then import what chunks will need."""
+    yield from pool.each(map_camera_window, (replace(first, span=span, start=start) for span in spans))
+    if isinstance(pool, OrderedPool):
+        pool.start(get_ready, first.settings)
 
 
 def with_short_windows(settings: BuildSettings) -> BuildSettings:

@@ -20,14 +20,12 @@ from torch import nn
 from torch.nn import functional as F
 
 from list3r.reconstruction.mvs.images import Tensor
-from list3r.weights import WeightsFormat
+from list3r.reconstruction.mvs.weights import read_weights
 
 PLANES = 64
 """Depths whose costs the network sees."""
 SIDE_FEATURES = 3
 """See `side_features`."""
-FORMAT = WeightsFormat("the plane sweep's network", version=1)
-SHIPPED = Path(__file__).with_name("weights.npz")
 
 _BLOCK = 12
 """Values of a picture under one cost: four pixels of three colours."""
@@ -131,10 +129,8 @@ def network_picture(color: NDArray[np.uint8], height: int, width: int) -> NDArra
 @lru_cache(maxsize=2)
 def load_network(path: Path | None = None, device: str = "cpu") -> SweepNetwork:
     """Return the trained network, by default the shipped one. Raises `OptionError` for what is wrong with its file."""
-    fix = "make it again with training/sweep.py" if path else "install list3r again"
-    arrays = FORMAT.read(path or SHIPPED, fix)
     network = SweepNetwork()
-    network.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+    network.load_state_dict({name: torch.from_numpy(value) for name, value in read_weights(path).items()})
     return network.eval().requires_grad_(False).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
