@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +34,14 @@ def given_poses(frames: Sequence[Frame]) -> tuple[Poses, NDArray[np.bool_]]:
             f"none of the frames {frames[0].index} to {frames[-1].index} has a valid pose; use --poses estimate"
         )
     return T, posed
+
+
+def small_motion(step: NDArray[np.float64]) -> Poses:
+    """Return a rigid motion of a translation and a rotation vector, radians. Shape (6,) -> (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(step[3:])[0]
+    T[:3, 3] = step[:3]
+    return T
 
 
 def angle_deg(T: Poses) -> float:

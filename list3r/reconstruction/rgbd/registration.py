@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import skew
 from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.poses import small_motion
 from list3r.reconstruction.rgbd.kernels import (
     Paired,
     bilinear,
@@ -165,7 +166,7 @@ def register(
             gradient += slope
         damped = information + 1e-9 * np.trace(information) * np.eye(6)
         step = -np.linalg.solve(damped, gradient)
-        T = _exp(step) @ T
+        T = small_motion(step) @ T
         if halved == settings.gate_halvings and iteration > 2 and np.abs(step).max() < settings.converged:
             break
     assert found is not None
@@ -210,7 +211,7 @@ def steps_without(
             more, slope64 = _normal_equations(rows[1][rest], error, spread(error, 1.0))
             information += settings.photometric_weight * more
             gradient += settings.photometric_weight * slope64
-        out.append(_exp(-np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient)))
+        out.append(small_motion(-np.linalg.solve(information + 1e-9 * np.trace(information) * np.eye(6), gradient)))
     return out
 
 
@@ -324,11 +325,3 @@ def _correlation(pairs: _SurfelPairs, frame: _Frame) -> float:
 def _cross(a: Floats, b: Floats) -> Floats:
     ax, ay, az, bx, by, bz = a[:, 0], a[:, 1], a[:, 2], b[:, 0], b[:, 1], b[:, 2]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
-
-
-def _exp(step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a small rigid motion of (translation, rotation vector). Shape (6,) -> (4, 4)."""
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(step[3:])[0]
-    T[:3, 3] = step[:3]
-    return T

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
+from list3r.reconstruction.poses import small_motion
+from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap
+from list3r.reconstruction.sfm.kernels import pose_equations
 from list3r.reconstruction.sfm.mapping import Poses, SparseMap
 from list3r.reconstruction.sfm.settings import FramePoseSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
@@ -141,16 +143,16 @@ def _refined(
     rows: NDArray[np.bool_],
     settings: FramePoseSettings,
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
-    T_cam_map, lens = inverse(start), make_lens(camera, "")
-    gate = settings.pose_error_px * pixel_unit(camera)
-    options = pycolmap.AbsolutePoseRefinementOptions()
-    options.loss_function_scale, options.gradient_tolerance = 0.5 * pixel_unit(camera), 1e-3
-    options.max_num_iterations = _ITERATIONS
+    """Return the pose by Gauss and Newton from `start`, and which points agree; None when too few do."""
+    T_cam_map, lens = inverse(start), np.array([camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5])
+    gate, scale = settings.pose_error_px * pixel_unit(camera), 0.5 * pixel_unit(camera)
     for _ in range(_ROUNDS):
-        found = pycolmap.refine_absolute_pose(rigid_of(T_cam_map), px, points, rows, lens, options)
-        if found is None:
-            return None
-        T_cam_map = matrix_of(found["cam_from_world"])
+        for _ in range(_ITERATIONS):
+            information, gradient = pose_equations(T_cam_map, px, points, rows, lens, scale)
+            try:
+                T_cam_map = small_motion(-np.linalg.solve(information, gradient)) @ T_cam_map
+            except np.linalg.LinAlgError:
+                return None
         seen = points @ T_cam_map[:3, :3].T + T_cam_map[:3, 3]
         z = np.maximum(seen[:, 2], 1e-9)
         at = seen[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx + 0.5, camera.cy + 0.5)
