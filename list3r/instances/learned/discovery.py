@@ -43,6 +43,8 @@ class LearnedSettings:
     least_confidence: float = 0.6
     """Things that are less probably one whole are scraps, which are kept but not listed; chosen on left-out worlds,
     where recall and precision meet near it."""
+    least_confidence_computed: float = 0.4
+    """... where depth was computed from pictures: a mask is right there more often than the networks are sure of it."""
     least_scrap: float = 0.1
     """Things that are less probably one whole are not even kept."""
     plane_area_m2: float = 0.25
@@ -91,7 +93,8 @@ class LearnedDiscoverer(CloudDiscoverer):
         cut = cut_cloud(surface, weights, self._learned.cut)
         if around.computed:
             cut = self._as_sure_as_depth(views, surface, cut, planes)
-        listed = (cut.verdicts.whole >= self._learned.least_confidence) | (cut.verdicts.structure > 0.5)
+        least = self._learned.least_confidence_computed if computed else self._learned.least_confidence
+        listed = (cut.verdicts.whole >= least) | (cut.verdicts.structure > 0.5)
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(weights)
         kept, features = _described(cloud, parted, up, views.unit, names)
@@ -105,7 +108,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         """The cut without what errors of computed depth explain."""
         s, doubt = self._learned.depth_errors, voxel_doubt(views, surface.cloud)
         cut = without_bends(surface, cut, planes, doubt, s)
-        return without_slivers(surface.cloud, cut, doubt, s, 0.5 * self._learned.least_confidence)
+        return without_slivers(surface.cloud, cut, doubt, s, 0.5 * self._learned.least_confidence_computed)
 
 
 def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudCut:
