@@ -43,9 +43,9 @@ class LearnedSettings:
     least_confidence: float = 0.6
     """Things that are less probably one whole are scraps, which are kept but not listed; chosen on left-out worlds,
     where recall and precision meet near it."""
-    least_confidence_computed: float = 0.3
-    """... where depth was computed from pictures: masks are right there more often than the networks are sure of them,
-    and a memory shows nothing below that (docs/decisions/0201-what-computed-depth-lists.md)."""
+    least_confidence_computed: float = 0.4
+    """... where depth was computed from pictures, with the best harmonic mean of recall and precision by masks
+    (docs/decisions/0201-what-computed-depth-lists.md)."""
     least_scrap: float = 0.1
     """Things that are less probably one whole are not even kept."""
     plane_area_m2: float = 0.25
