@@ -44,7 +44,7 @@ class LearnedSettings:
     """Things that are less probably one whole are scraps, which are kept but not listed; chosen on left-out worlds,
     where recall and precision meet near it."""
     least_confidence_computed: float = 0.4
-    """... where depth was computed from pictures, with the best harmonic mean of recall and precision by masks
+    """... where depth was computed from pictures; anything from 0.3 to 0.5 does as well on left-out rooms
     (docs/decisions/0201-what-computed-depth-lists.md)."""
     least_scrap: float = 0.1
     """Things that are less probably one whole are not even kept."""
