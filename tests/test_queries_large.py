@@ -119,6 +119,29 @@ def test_words_stand_for_the_same_things(store: Store, words: str, large: pytest
     assert ask() == wanted
 
 
+@pytest.mark.parametrize("predicates", [("near",), ("on", "next_to"), ("in",)])
+def test_pairs_are_those_of_the_relations_and_follow_what_is_written(store: Store, predicates: tuple[str, ...]) -> None:
+    some, others = range(1, COUNT, 2), range(5, COUNT)
+
+    def pairs(subjects: range | None, objects: range | None) -> list[tuple[int, int]]:
+        return sorted(store.relations.pairs(predicates, subjects, objects))
+
+    def expected(subjects: range | None, objects: range | None) -> list[tuple[int, int]]:
+        held = [(r.subject, r.object) for r in store.relations.all() if r.predicate in predicates]
+        return sorted(
+            (a, b) for a, b in held if (subjects is None or a in subjects) and (objects is None or b in objects)
+        )
+
+    for ends in ((some, others), (others, some), (some, None), (None, some), (range(0), others)):
+        assert pairs(*ends) == expected(*ends)
+    before = pairs(some, others)
+    with contextlib.suppress(ZeroDivisionError), store.transaction():
+        store.relations.replace([], [Relation(1, predicates[0], COUNT - 1, 0.9, 0.1)])
+        assert pairs(some, others) == sorted({*before, (1, COUNT - 1)})
+        raise ZeroDivisionError
+    assert pairs(some, others) == before
+
+
 def test_what_is_common_is_looked_for_around_the_place(store: Store, large: pytest.MonkeyPatch) -> None:
     wanted = nearest(store, words="mug", point=(4.0, 4.0, 1.0), k=9)
     large.setattr(gather, "EVERYTHING", 0)
