@@ -16,12 +16,10 @@ from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
 from list3r.queries.finding.words import STRUCTURE, no_such_words
 from list3r.queries.match import Match, Matches, checked_count, checked_instance, of_one_state
 from list3r.queries.relations import Place, viewer_from
-from list3r.queries.views.gather import Gathered, gather, is_large
+from list3r.queries.views.gather import Gathered, gather, is_large, sample
 
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
-_NAMED_EVERY = 4
-"""Of the sample of a large memory, each so many tell what most things are called."""
 _ALIKE = 0.1
 """Sizes that differ by less than this share are equally the biggest."""
 
@@ -158,8 +156,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
         if by_vector is not None:
             return by_vector
         search.unknown += unknown
-        few = [] if search.gathered is None else search.store.instances.of(search.gathered.sample[::_NAMED_EVERY])
-        named = search.things.values() if search.gathered is None else few
+        named = search.things.values() if search.gathered is None else sample(search.store)
         search.notes.append(no_such_words(unknown, named))
         return []
     structure = not STRUCTURE.isdisjoint(phrase.words) or bool(

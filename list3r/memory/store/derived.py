@@ -26,6 +26,24 @@ class Derived:
         return found
 
 
+class CurrentCache(Generic[K, V]):
+    """What was read of a file, those values that were asked for last; dropped when the file has changed."""
+
+    def __init__(self, stamp: Callable[[], object], limit: int, size: Callable[[V], int]) -> None:
+        """`stamp` tells the state of the file; see `LruCache` for the others."""
+        self._stamp, self._limit, self._size = stamp, limit, size
+        self._values: LruCache[K, V] = LruCache(limit, size)
+        self._state: object = None
+
+    def get(self, key: K, read: Callable[[], V]) -> V:
+        """Return what is kept, else what `read` returns."""
+        state = self._stamp()
+        if state != self._state:
+            self._values, self._state = LruCache(self._limit, self._size), state
+        held = self._values.get(key)
+        return self._values.put(key, read()) if held is None else held
+
+
 class LruCache(Generic[K, V]):
     """Values that were asked for last; those used longest ago are dropped when all together exceed a limit, and at the
     end of a turn, where there are turns, those that nobody asked for in the last `turns`."""

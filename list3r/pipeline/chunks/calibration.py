@@ -59,10 +59,10 @@ def estimated_camera(
     """
     if not is_camera_wanted(source.info, options, settings):
         return None
-    name, info = entry(settings.reconstruction).calibration, source.info
+    info = source.info
     with threadpool_limits(1):
         progress = None if look is None else (lambda done, total: look("camera", done, total))
-        module = import_module(f"list3r.reconstruction.{name}")
+        module = _module(settings)
         size = info.stored_size or info.image_size
         assert size is not None
         stored_px = max(size) / max(info.image_size or size)
@@ -95,16 +95,20 @@ class CameraWindow:
     """The camera that its map begins with."""
 
 
-def get_ready_for_camera(settings: BuildSettings) -> ModuleType:
+def get_ready_for_camera(settings: BuildSettings) -> None:
     """Import what windows need, which takes less time than what chunks do."""
+    _module(settings)
+
+
+def _module(settings: BuildSettings) -> ModuleType:
+    """Return the module that estimates the camera for a model."""
     return import_module(f"list3r.reconstruction.{entry(settings.reconstruction).calibration}")
 
 
 def map_camera_window(window: CameraWindow) -> Any:
     """Return what the model's module makes of one window."""
-    module = get_ready_for_camera(window.settings)
     source = open_once(window.path, window.options)
-    return module.map_window(source, *window.span, window.start, window.settings.models.sfm)
+    return _module(window.settings).map_window(source, *window.span, window.start, window.settings.models.sfm)
 
 
 def _mapped(pool: ChunkPool, first: CameraWindow, spans: Sequence[tuple[int, int]], start: Camera) -> Iterable[Any]:

@@ -27,7 +27,9 @@ _MOST_BEARING = 300_000
 _MOST = 5_000
 """Instances that are loaded for one phrase, at most."""
 _SAMPLE = 1_000
-"""Instances that tell how large things are, and what they are called."""
+"""Instances that tell how large things are,"""
+_NAMED = 250
+"""and what they are called."""
 _KEPT = 20
 """Of a phrase of which nothing stands as it should: enough to say so."""
 
@@ -81,8 +83,8 @@ def is_large(store: Store) -> bool:
 
 
 def sample(store: Store) -> list[Instance]:
-    """Return all instances, or some of all in a memory that holds too many."""
-    return store.instances.of(store.ids.sample(_SAMPLE)) if is_large(store) else store.instances.all()
+    """Return all instances, or in a memory that holds too many some that tell what things are called."""
+    return store.instances.of(store.ids.sample(_NAMED)) if is_large(store) else store.instances.all()
 
 
 def gather(store: Store, phrase: Phrase) -> Gathered | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.records import Relation
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import CurrentCache
 from list3r.memory.store.rows.columns import Columns
 from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.ids import Ids
@@ -28,9 +28,9 @@ class RelationTable:
         order, columns = "subject, predicate, object", Columns.of(Relation)
         self._rows = Table(connection, "relations", columns, order, checked=True)
         self._unchecked = Table(connection, "relations", columns, order)
-        self._kept = _kept()
-        self._kept_of: object = None
-        """State of the file in which they were read."""
+        self._kept: CurrentCache[tuple[str, str, tuple[str, ...]], NDArray[np.int64]] = CurrentCache(
+            connection.stamp, _KEPT_BYTES, lambda pairs: pairs.nbytes
+        )
 
     def replace(self, subjects: Iterable[int] | None, relations: Iterable[Relation]) -> None:
         """Replace all relations that touch these instances (all relations when `subjects` is None)."""
@@ -81,23 +81,16 @@ class RelationTable:
 
         An id has few relations: reading them all costs less than looking each predicate up. Shape (N, 2).
         """
-        state = self._connection.stamp()
-        if state != self._kept_of:
-            self._kept, self._kept_of = _kept(), state
-        kept = self._kept.get((column, ids, predicates))
-        if kept is None:
-            query = (
-                f"SELECT subject, object FROM relations WHERE {column} IN (SELECT value FROM json_each(?))"
-                f" AND +predicate IN ({','.join('?' * len(predicates))})"
-            )
-            rows = self._connection.rows(query, (ids, *predicates))
-            kept = self._kept.put((column, ids, predicates), np.array(rows, np.int64).reshape(-1, 2))
-        return kept
+        query = (
+            f"SELECT subject, object FROM relations WHERE {column} IN (SELECT value FROM json_each(?))"
+            f" AND +predicate IN ({','.join('?' * len(predicates))})"
+        )
+
+        def read() -> NDArray[np.int64]:
+            return np.array(self._connection.rows(query, (ids, *predicates)), np.int64).reshape(-1, 2)
+
+        return self._kept.get((column, ids, predicates), read)
 
     def drop(self, instance_id: int) -> None:
         """Forget the relations of an instance."""
         self._rows.delete("subject = ? OR object = ?", (instance_id, instance_id))
-
-
-def _kept() -> LruCache[tuple[str, str, tuple[str, ...]], NDArray[np.int64]]:
-    return LruCache(_KEPT_BYTES, lambda pairs: pairs.nbytes)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import CurrentCache
 from list3r.memory.store.rows.columns import UNREADABLE
 from list3r.memory.store.word_index import ASK_STAMP, STAMP, expected_words, hundredths
 
@@ -27,9 +27,9 @@ class Words:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._kept = _kept()
-        self._kept_of: object = None
-        """State of the file in which they were read."""
+        self._kept: CurrentCache[str, Bearers] = CurrentCache(
+            connection.stamp, _KEPT_BYTES, lambda bearers: bearers[0].nbytes + bearers[1].nbytes
+        )
 
     def known(self, words: Iterable[str]) -> set[str]:
         """Those of some words that any instance has."""
@@ -71,14 +71,8 @@ class Words:
 
     def _bearers_of(self, word: str) -> Bearers:
         """Return all that have a word, from what is kept while the file stays as it is."""
-        state = self._connection.stamp()
-        if state != self._kept_of:
-            self._kept, self._kept_of = _kept(), state
-        kept = self._kept.get(word)
-        if kept is None:
-            rows = self._connection.rows("SELECT instance, weight FROM words WHERE word = ? ORDER BY instance", (word,))
-            kept = self._kept.put(word, self._bearers(rows))
-        return kept
+        query = "SELECT instance, weight FROM words WHERE word = ? ORDER BY instance"
+        return self._kept.get(word, lambda: self._bearers(self._connection.rows(query, (word,))))
 
     def bearing_most(self, words: Sequence[str], limit: int) -> list[list[int]]:
         """Ids of the instances that have some words or, of three letters on, words that begin so: those that have the
@@ -126,7 +120,3 @@ class Words:
                 held.setdefault(instance, {})[word] = weight
         found = [(-sum(weights.values()), n) for n, weights in held.items() if len(weights) == len(words)]
         return [(n, -total) for total, n in sorted(found)]
-
-
-def _kept() -> LruCache[str, Bearers]:
-    return LruCache(_KEPT_BYTES, lambda bearers: bearers[0].nbytes + bearers[1].nbytes)
