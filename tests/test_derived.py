@@ -67,6 +67,25 @@ def test_what_nobody_asked_for_in_the_last_turns_is_dropped() -> None:
     assert kept.get("asked") == "again"
 
 
+class _Passing(LruCache[str, str]):
+    def __init__(self) -> None:
+        super().__init__(100, turns=1)
+
+
+class _Lasting(LruCache[str, str]):
+    def __init__(self) -> None:
+        super().__init__(100)
+
+
+def test_a_turn_ends_for_all_caches_of_a_store_that_have_turns() -> None:
+    derived = Derived()
+    derived.of(_Passing).put("left", "behind")
+    derived.of(_Lasting).put("kept", "on")
+    for _ in range(3):
+        derived.end_turn()
+    assert derived.of(_Passing).get("left") is None and derived.of(_Lasting).get("kept") == "on"
+
+
 @pytest.mark.parametrize("period", [2, 3, 4])
 @pytest.mark.parametrize("count", [65, 100, 200, 1000])
 def test_the_sample_of_a_walk_to_and_fro_holds_all_places_about_as_often(count: int, period: int) -> None:

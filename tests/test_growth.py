@@ -248,7 +248,7 @@ def test_things_of_chunks_that_trembled_lie_where_the_chunks_lie_when_a_session_
     for index in range(5):
         add(store, visit(walks, index, index))
     before = {i.id: i.aabb for i in store.instances.all()}
-    own = {n for n, a in store.library.anchors.all().items() if a.chunk_id == 2}
+    own = {n for some in store.library.anchors.all() for n, a in some.items() if a.chunk_id == 2}
     off = np.array([0.001, 0.0015, 0.0])
     with store.transaction():
         store.chunks.place({2: Sim3.exp(np.array([*off, 0, 0, 0, 0]))}, {2: 1})

@@ -118,18 +118,16 @@ class GraphProblem:
         """Return diagonal blocks, off-diagonal blocks of the inner edges, and the gradient, for right-hand steps."""
         d = self.size
         to_u, to_v = self.jacobians(e)
-        both = np.concatenate([to_u, to_v], axis=2)
-        weighted = (self.information * trust[:, None, None]) @ both
-        blocks = np.swapaxes(both, 1, 2) @ weighted
-        push = np.einsum("eji,ej->ei", weighted, e)
+        information = self.information * trust[:, None, None]
         count = self.pattern.count
         diagonal, gradient = np.zeros((count, d, d)), np.zeros((count, d))
-        for chunk, part in ((self.u, slice(0, d)), (self.v, slice(d, 2 * d))):
+        for chunk, to in ((self.u, to_u), (self.v, to_v)):
             here = self.free[chunk]
             moving = here >= 0
-            diagonal += _gathered(here[moving], blocks[moving, part, part], count)
-            gradient += _gathered(here[moving], push[moving, part], count)
-        return diagonal, blocks[self.inner, :d, d:], gradient
+            weighted = information @ to
+            diagonal += _gathered(here[moving], (np.swapaxes(to, 1, 2) @ weighted)[moving], count)
+            gradient += _gathered(here[moving], np.einsum("eji,ej->ei", weighted, e)[moving], count)
+        return diagonal, (np.swapaxes(to_u, 1, 2) @ weighted)[self.inner], gradient
 
     def jacobians(self, e: Array) -> tuple[Array, Array]:
         """Return derivatives of the errors by right-hand steps of u and of v. Shapes (E, D, D).

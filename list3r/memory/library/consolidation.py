@@ -70,7 +70,7 @@ def consolidate(
     summaries, before = chunk_summaries(store, s.shapes, hold=True), store.library.settled.all()
     if not ended:
         summaries.keep_sample()
-        summaries.end_turn()
+        store.derived.end_turn()
     ledger = read_ledger(store, chunks)
     carried = _carry(store, summaries, s) if ended and ledger is not None else None
     known = store.facts[WORLD]
@@ -203,6 +203,7 @@ def _told_otherwise(group: Group, before: ChangeLedger, now: ChangeLedger) -> bo
 def _describe_anew(region: Region) -> None:
     """Write the words for instances in the light of the world as it is now, where they are others."""
     store, metric = region.store, region.store.facts.scale_kind != "relative"
-    known = {looks.instance: looks for looks in store.library.looks.all()}
-    told = (in_light(i, known[i.id], region.world, metric=metric) for i in store.instances.all())
-    store.instances.put(i for i in told if i is not None)
+    for known in store.library.looks.all():
+        instances = store.instances.of(sorted(known))
+        told = (in_light(i, known[i.id], region.world, metric=metric) for i in instances)
+        store.instances.put(i for i in told if i is not None)

@@ -18,7 +18,7 @@ from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import BestView
 from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box, without_strays
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import KEPT_TURNS, LruCache
 from list3r.memory.store.store import Store
 
 _KEPT_BYTES = 6 << 20
@@ -128,7 +128,7 @@ class InstanceCache(LruCache[tuple[object, ...], DerivedInstance]):
     """Instances as they were derived from their members, by a digest of those: their names grow with the chunks."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, _bytes_of)
+        super().__init__(_KEPT_BYTES, _bytes_of, KEPT_TURNS)
         self.stamps = itertools.count(1)
 
 

@@ -25,7 +25,7 @@ from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, pair_s
 from list3r.memory.overlap.summaries import ChunkSummary, Summaries
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, Ints
 from list3r.memory.records import ChunkRow, MotionTrack
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import KEPT_TURNS, LruCache
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.library import RedundantInstance, SettledRow
 
@@ -64,7 +64,7 @@ class PairCache(LruCache[tuple[int, int], _LinkedPair]):
     """Pairs of chunks by their ids."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT)
+        super().__init__(_KEPT, turns=KEPT_TURNS)
 
 
 class _Chunks(dict[int, SettledRow]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -126,14 +126,18 @@ def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[i
     """Move the boxes of instances that were not `written` anew to where their chunks lie to the last digit, which is
     less far than makes them be derived anew. `settled` are S_world_chunk of where chunks are settled.
     """
-    known = {n: a for n, a in store.library.anchors.all().items() if n not in written}
-    hung = sorted({a.chunk_id for a in known.values()})
-    exact = {k: store.chunks.get(k).S_world_chunk @ settled[k].inverse() for k in hung}
-    lie = np.array([exact[a.chunk_id].as_matrix() for a in known.values()]).reshape(-1, 4, 4)
-    lay = np.array([a.S_exact_settled.as_matrix() for a in known.values()]).reshape(-1, 4, 4)
-    elsewhere = (np.abs(lie - lay) > _ROUNDED).any(axis=(1, 2)).tolist()
-    others = {n: a for (n, a), move in zip(known.items(), elsewhere, strict=True) if move}
-    for some in _batches(sorted(others)):
+    exact: dict[int, Sim3] = {}
+    for anchors in store.library.anchors.all():
+        known = {n: a for n, a in anchors.items() if n not in written}
+        for k in {a.chunk_id for a in known.values()} - exact.keys():
+            exact[k] = store.chunks.get(k).S_world_chunk @ settled[k].inverse()
+        lie = np.array([exact[a.chunk_id].as_matrix() for a in known.values()]).reshape(-1, 4, 4)
+        lay = np.array([a.S_exact_settled.as_matrix() for a in known.values()]).reshape(-1, 4, 4)
+        elsewhere = (np.abs(lie - lay) > _ROUNDED).any(axis=(1, 2)).tolist()
+        others = {n: a for (n, a), move in zip(known.items(), elsewhere, strict=True) if move}
+        if not others:
+            continue
+        some = list(others)
         instances = store.instances.of(some)
         before = stack([others[i.id].S_exact_settled for i in instances])
         now = stack([exact[others[i.id].chunk_id] for i in instances])
@@ -151,7 +155,7 @@ def put_exactly(store: Store, settled: Mapping[int, Sim3], written: Collection[i
             for i, d, s in zip(instances, by, sigma, strict=True)
         ]
         store.instances.set_places(there)
-    store.library.anchors.put({n: Anchor(a.chunk_id, exact[a.chunk_id]) for n, a in others.items()})
+        store.library.anchors.put({n: Anchor(a.chunk_id, exact[a.chunk_id]) for n, a in others.items()})
 
 
 def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None) -> None:
@@ -159,8 +163,11 @@ def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None
     world to where it lies. Boxes in the component that is `upright` stay so; a box along the axes grows or shrinks as
     the one round the turned box does. What hangs on another chunk, which was measured anew, is left to be derived.
     """
-    anchors = {n: a for n, a in store.library.anchors.all().items() if a.chunk_id in moves}
-    for some in _batches(sorted(anchors)):
+    for some_anchors in store.library.anchors.all():
+        anchors = {n: a for n, a in some_anchors.items() if a.chunk_id in moves}
+        if not anchors:
+            continue
+        some = list(anchors)
         instances = store.instances.of(some)
         exact = stack([anchors[i.id].S_exact_settled for i in instances])
         by = stack([moves[anchors[i.id].chunk_id] for i in instances])
@@ -179,7 +186,7 @@ def carry_instances(store: Store, moves: Mapping[int, Sim3], upright: int | None
             replace(i, center=c, aabb=a, box=OrientedBox(c, edges, R), position_sigma_m=s)
             for i, c, a, edges, R, s in rows
         )
-    store.library.anchors.put({n: Anchor(a.chunk_id, Sim3.identity()) for n, a in anchors.items()})
+        store.library.anchors.put({n: Anchor(a.chunk_id, Sim3.identity()) for n, a in anchors.items()})
 
 
 def _sigmas(store: Store, ids: Sequence[int], centers: Array) -> list[float | None]:
@@ -193,13 +200,6 @@ def _sigmas(store: Store, ids: Sequence[int], centers: Array) -> list[float | No
 
 _ROUNDED = 1e-9
 """What products of poses round, and nothing is moved for."""
-_TOGETHER = 2048
-"""Instances that are moved at once."""
-
-
-def _batches(ids: Sequence[int]) -> Iterator[Sequence[int]]:
-    for first in range(0, len(ids), _TOGETHER):
-        yield ids[first : first + _TOGETHER]
 
 
 def _centers(instances: Sequence[Instance]) -> Array:

@@ -13,10 +13,10 @@ from list3r.memory.description.colors import Reference, lab_from_rgb, scene_refe
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.metre import metre_by_sight
 from list3r.memory.overlap.planes import Planes, chunk_planes
-from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, ShapeSettings, chunk_shapes, read_every, with_samples
+from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, read_every, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.settings import stored_settings
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import KEPT_TURNS, LruCache
 from list3r.memory.store.store import Store
 
 T = TypeVar("T")
@@ -60,8 +60,6 @@ class SampledChunk:
 _KEPT_BYTES = 48 << 20
 """Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
 with chunks. Of a chunk with 12 instances it takes 0.2 MB, of one with 50 a megabyte."""
-_KEPT_TURNS = 16
-"""Chunks that come until a summary that none of them asked for is dropped: a walk leaves most of a house behind."""
 _SAMPLED = 64
 """Chunks of a long memory that tell what holds for all of it: its light, its scale, which way is up."""
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0
@@ -80,7 +78,7 @@ class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None, frozenset[int]
     """Summaries by chunk id, checksum of what the chunk measured, settings, and local instances that are left out."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, _bytes_of, _KEPT_TURNS)
+        super().__init__(_KEPT_BYTES, _bytes_of, KEPT_TURNS)
 
 
 _HELD_BYTES = 256 << 20
@@ -158,11 +156,6 @@ class Summaries(Mapping[int, ChunkSummary]):
             for chunk_id in sample:
                 self.sampled(chunk_id)
             known.newest = sample[-1]
-
-    def end_turn(self) -> None:
-        """Drop what none of the last chunks asked for."""
-        self._known.end_turn()
-        self._store.derived.of(GrownCells).end_turn()
 
     def _checksum(self, chunk_id: int) -> int:
         if chunk_id not in self._checked:

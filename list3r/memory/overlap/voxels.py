@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import lab_from_rgb
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import FrameSamples
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import KEPT_TURNS, LruCache
 from list3r.memory.store.tables.local_instances import LocalNode
 
 Ints = NDArray[np.int64]
@@ -315,8 +315,6 @@ def lies_on(points: Array, target: ChunkShapes, grown: GrownCells | None = None)
 
 _KEPT_BYTES = 32 << 20
 """Those of some 70 chunks with a dozen things: of a place that many sessions saw, all are asked for with each chunk."""
-_KEPT_TURNS = 16
-"""Chunks that come until cells that none of them asked for are dropped."""
 
 
 @dataclass(frozen=True)
@@ -350,7 +348,7 @@ class GrownCells(LruCache[int, _Grown]):
     """Grown cells of the chunks that were compared last: they take more memory than all else of a chunk."""
 
     def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, lambda g: g.keys.nbytes + g.start.nbytes + g.owner.nbytes, _KEPT_TURNS)
+        super().__init__(_KEPT_BYTES, lambda g: g.keys.nbytes + g.start.nbytes + g.owner.nbytes, KEPT_TURNS)
 
     def of(self, shapes: ChunkShapes) -> _Grown:
         """Return the cells within the tolerance of each instance."""

@@ -10,12 +10,21 @@ T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
+KEPT_TURNS = 8
+"""Chunks that come until what none of them asked for is dropped: a walk leaves most of a house behind."""
+
 
 class Derived:
     """Caches that belong to one open store: one object of each class, dropped together with the store."""
 
     def __init__(self) -> None:
         self._objects: dict[type, object] = {}
+
+    def end_turn(self) -> None:
+        """Let caches that have turns drop what was not asked for in the last ones."""
+        for found in self._objects.values():
+            if isinstance(found, LruCache):
+                found.end_turn()
 
     def of(self, kind: type[T]) -> T:
         """Return the store's object of a class, made without arguments when it is first asked for."""
@@ -82,7 +91,7 @@ class LruCache(Generic[K, V]):
     def end_turn(self) -> None:
         """Drop what was not asked for in the last turns."""
         self._turn += 1
-        while self._values and self._asked[next(iter(self._values))] < self._turn - self._turns:
+        while self._turns and self._values and self._asked[next(iter(self._values))] < self._turn - self._turns:
             self._drop_oldest()
 
     def _drop_oldest(self) -> None:

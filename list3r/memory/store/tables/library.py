@@ -6,7 +6,7 @@ as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -23,6 +23,8 @@ from list3r.memory.store.rows.table import Table, batches
 
 Key = tuple[int, int]
 """(chunk id, local id)."""
+_TOGETHER = 1024
+"""Instances whose rows are read at once where all are asked for, so that a large memory takes no more room."""
 
 
 @dataclass(frozen=True)
@@ -357,10 +359,11 @@ class Anchors:
         """Record which chunk instances are attached to, by id."""
         self._rows.put(_AnchorRow(n, a.chunk_id, a.S_exact_settled) for n, a in anchors.items())
 
-    def all(self, ids: Sequence[int] | None = None) -> dict[int, Anchor]:
-        """Return the anchors of some instances, or of all, by id."""
-        rows = self._rows.all() if ids is None else self._rows.among("instance", ids)
-        return {row.instance: Anchor(row.chunk_id, row.S_exact_settled) for row in rows}
+    def all(self) -> Iterator[dict[int, Anchor]]:
+        """Yield the anchors of all instances by id, some thousand at a time."""
+        for some, _ in batches(self._rows.values("instance", "1"), _TOGETHER):
+            rows = sorted(self._rows.among("instance", some), key=lambda row: row.instance)
+            yield {row.instance: Anchor(row.chunk_id, row.S_exact_settled) for row in rows}
 
     def drop(self, instance_id: int) -> None:
         """Forget which chunk an instance is attached to."""
@@ -390,9 +393,10 @@ class LooksTable:
         """Write the looks of instances."""
         self._rows.put(looks)
 
-    def all(self) -> list[Looks]:
-        """Return the looks of all instances by id."""
-        return self._rows.all()
+    def all(self) -> Iterator[dict[int, Looks]]:
+        """Yield the looks of all instances by id, some thousand at a time."""
+        for some, _ in batches(self._rows.values("instance", "1"), _TOGETHER):
+            yield {looks.instance: looks for looks in self._rows.among("instance", some)}
 
     def count(self) -> int:
         """Return of how many instances the looks are known."""
