@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _SMALL_FRONT = 10
-"""Fronts of up to so many blocks are joined to their parent whatever zeros that adds: calls cost more than sums. A factor
-of larger ones takes more room, at no gain of time."""
+"""Fronts of up to so many blocks are joined to their parent whatever zeros that adds: calls cost more than sums. A
+factor of larger ones takes more room, at no gain of time."""
 _ZEROS = 0.2
 """Share of zeros that joining two larger fronts may add."""
 
