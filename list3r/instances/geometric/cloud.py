@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from list3r.instances.geometric.fusion import View
 from list3r.instances.geometric.kernels import meeting, sums_by
@@ -119,12 +117,3 @@ def neighbour_pairs(keys: NDArray[np.int64], radius: int) -> tuple[NDArray[np.in
         left.append(here)
         right.append(there)
     return np.concatenate(left), np.concatenate(right)
-
-
-def component_numbers(
-    left: NDArray[np.int64], right: NDArray[np.int64], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Connected components of a graph given by its edges: the number of each of `count` nodes, and the sizes."""
-    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count))
-    number = np.asarray(connected_components(graph, directed=False)[1], np.int64)
-    return number, np.bincount(number, minlength=1)

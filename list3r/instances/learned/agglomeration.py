@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.instances.geometric.cloud import component_numbers
+from list3r.instances.learned.kernels import least_of_groups
 
 Float = NDArray[np.float32]
 
@@ -40,7 +40,7 @@ def agglomerate(
         mutual = (mean > threshold) & (mean >= best[a]) & (mean >= best[b])
         if not mutual.any():
             break
-        parent = _joined(count, a[mutual], b[mutual])
+        parent = least_of_groups(count, a[mutual], b[mutual])
         own = parent[own]
         a, b = parent[a], parent[b]
         apart = a != b
@@ -52,11 +52,3 @@ def agglomerate(
     _, first, number = np.unique(own, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return np.asarray(rank[number], np.int64)
-
-
-def _joined(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The least piece of each connected group. Shape (count,)."""
-    number, _ = component_numbers(a, b, count)
-    least = np.full(int(number.max(initial=-1)) + 1, count)
-    np.minimum.at(least, number, np.arange(count))
-    return np.asarray(least[number])

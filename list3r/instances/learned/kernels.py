@@ -48,6 +48,24 @@ def way_costs(
 
 
 @compiled
+def least_of_groups(count: int, left: Codes, right: Codes) -> Codes:
+    """The least of each of `count` nodes' connected group. Shape (count,)."""
+    above = np.arange(count)
+    for k in range(len(left)):
+        a, b = left[k], right[k]
+        while above[a] != a:
+            above[a] = above[above[a]]
+            a = above[a]
+        while above[b] != b:
+            above[b] = above[above[b]]
+            b = above[b]
+        above[max(a, b)] = min(a, b)
+    for n in range(count):
+        above[n] = above[above[n]]
+    return above
+
+
+@compiled
 def touching(labels: Ints, left: Ints, right: Ints, count: int) -> tuple[Ints, Ints, Codes]:
     """Pairs of neighbouring voxels of different pieces: that of the lesser piece, the other one, and their code."""
     here, there, code = np.empty(len(left), np.int32), np.empty(len(left), np.int32), np.empty(len(left), np.int64)
