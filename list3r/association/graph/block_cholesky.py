@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_SMALL_FRONT = 10
+_SMALL_FRONT = 7
 """Fronts of up to so many blocks are joined to their parent whatever zeros that adds: calls cost more than sums. A
 factor of larger ones takes more room, at no gain of time."""
 _ZEROS = 0.2
