@@ -25,7 +25,7 @@ numbers do; in pages of 4 KiB each of 256 takes a page of overflow, four times t
 """
 _CACHE_KIB = 65536
 """Pages that a connection keeps to read;"""
-_WRITER_CACHE_KIB = 4096
+_WRITER_CACHE_KIB = 2048
 """and one that writes, which touches little at a time."""
 _READERS_WAIT_S = 8.0
 """How long a new writer waits until nobody is amid a reading; those that begin while it writes are not in its way."""
