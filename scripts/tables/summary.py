@@ -1,0 +1,116 @@
+"""The table of README.md: what was measured, the measure, the result, a reference, and the commit."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+from tables.results import commit, elsewhere, read, sessions, table
+
+_BOXES = "boxes at IoU 0.25"
+
+
+def summary() -> str:
+    """Return the rows of README.md."""
+    return table(
+        ["", "measure", "result", "reference", "commit"],
+        [*_camera_paths(), *_instances(), *_relations_and_changes(), *_memory()],
+    )
+
+
+def _camera_paths() -> list[list[str]]:
+    depth, colour = read("redkitchen"), read("sfm")
+    fair, returns = read("association-fair")["runs"], read("association-returns")["runs"]
+    return [
+        [
+            "camera path, real kitchen, 1,000 frames with depth",
+            "ATE RMSE after SE(3)",
+            f"{100 * depth['ate_se3_m']:.1f} cm, {depth['frames_per_second']:.0f} frames/s",
+            "ground truth accurate to a few cm",
+            commit("redkitchen"),
+        ],
+        [
+            "camera path, same kitchen, colour only",
+            "ATE RMSE after Sim(3)",
+            f"{100 * colour['list3r']['ate_sim3_m']:.1f} cm, {colour['list3r']['frames_per_s']:.0f} frames/s",
+            f"plain pycolmap {100 * colour['pycolmap']['ate_sim3_m']:.1f} cm",
+            commit("sfm"),
+        ],
+        [
+            "camera path, long simulated videos with revisits, simulated network",
+            "ATE RMSE after Sim(3), median",
+            _ate(fair, "full"),
+            f"VGGT-Long's association {_ate(fair, 'vggt-long')}",
+            commit("association-fair"),
+        ],
+        [
+            "the same, but places look different when revisited",
+            "ATE RMSE after Sim(3), median",
+            _ate(returns, "full"),
+            f"without instances {_ate(returns, 'full-no-instances')}",
+            commit("association-returns"),
+        ],
+    ]
+
+
+def _ate(runs: Sequence[Any], variant: str) -> str:
+    e = [100 * r["ate_sim3_m"] for r in runs if r["variant"] == variant]
+    return f"{statistics.median(e):.1f} cm (mean {statistics.mean(e):.1f}, worst {max(e):.0f})"
+
+
+def _instances() -> list[list[str]]:
+    worlds, house, own = (read(n)["mean"] for n in ("discovery", "discovery-house", "simulated"))
+    return [
+        ["instances, simulated homes (whole walks)", _BOXES, _found(own), "", commit("simulated")],
+        [
+            "instances, ten held-out simulated worlds (one chunk)",
+            _BOXES,
+            _found(worlds["learned"]),
+            f"with true masks {_found(worlds['true'])}",
+            commit("discovery"),
+        ],
+        [
+            "instances, renderings of a house modelled by others (one chunk)",
+            _BOXES,
+            _found(house["learned"]),
+            f"with true masks {_found(house['true'])}",
+            commit("discovery-house"),
+        ],
+    ]
+
+
+def _found(mean: Any) -> str:
+    return f"{mean['recall_0.25']:.2f} recall, {mean['precision_0.25']:.2f} precision"
+
+
+def _relations_and_changes() -> list[list[str]]:
+    own, masked = read("simulated")["mean"], read("relations")["pooled"]
+    second = [(*sessions()[0], "sessions"), *elsewhere()]
+    return [
+        [
+            "`on` relations, simulated homes",
+            "pairs",
+            f"{own['on_recall']:.2f} recall, {own['on_precision']:.2f} precision",
+            f"with true masks {masked['on']['recall']:.2f}, {masked['on']['precision']:.2f}",
+            commit("simulated"),
+        ],
+        *(
+            [f"changes between two sessions, {name}", "F1 of records", f"{t['all']['f1']:.2f}", "", commit(file)]
+            for name, t, file in second
+        ),
+    ]
+
+
+def _memory() -> list[list[str]]:
+    scale, kills = read("scale")["sizes"][-1], read("safety")["asked"]["kills"]
+    return [
+        [
+            "`nearest` among a million instances",
+            "processor time, median",
+            f"{scale['nearest_cpu_p50_ms']:.1f} ms",
+            "",
+            commit("scale"),
+        ],
+        ["killed at random moments", "data lost", f"none in {kills} runs", "", commit("safety")],
+    ]
