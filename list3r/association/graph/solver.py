@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 _CONVERGED = 1e-12
 """Relative gain of a step at which the cost has settled."""
+_TOGETHER = 256
+"""Edges whose derivatives are held at once."""
 
 
 @dataclass(frozen=True)
@@ -116,32 +118,35 @@ class GraphProblem:
 
     def _normal_equations(self, e: Array, trust: Array) -> tuple[Array, Array, Array]:
         """Return diagonal blocks, off-diagonal blocks of the inner edges, and the gradient, for right-hand steps."""
-        d = self.size
-        to_u, to_v = self.jacobians(e)
-        information = self.information * trust[:, None, None]
-        count = self.pattern.count
+        d, count = self.size, self.pattern.count
         diagonal, gradient = np.zeros((count, d, d)), np.zeros((count, d))
-        for chunk, to in ((self.u, to_u), (self.v, to_v)):
-            here = self.free[chunk]
-            moving = here >= 0
-            weighted = information @ to
-            diagonal += _gathered(here[moving], (np.swapaxes(to, 1, 2) @ weighted)[moving], count)
-            gradient += _gathered(here[moving], np.einsum("eji,ej->ei", weighted, e)[moving], count)
-        return diagonal, (np.swapaxes(to_u, 1, 2) @ weighted)[self.inner], gradient
+        off = np.empty((len(e), d, d))
+        for start in range(0, len(e), _TOGETHER):
+            some = slice(start, start + _TOGETHER)
+            to_u, to_v = self.jacobians(e, some)
+            information = self.information[some] * trust[some, None, None]
+            for chunk, to in ((self.u[some], to_u), (self.v[some], to_v)):
+                here = self.free[chunk]
+                moving = here >= 0
+                weighted = information @ to
+                diagonal += _gathered(here[moving], (np.swapaxes(to, 1, 2) @ weighted)[moving], count)
+                gradient += _gathered(here[moving], np.einsum("eji,ej->ei", weighted, e[some])[moving], count)
+            off[some] = np.swapaxes(to_u, 1, 2) @ weighted
+        return diagonal, off[self.inner], gradient
 
-    def jacobians(self, e: Array) -> tuple[Array, Array]:
-        """Return derivatives of the errors by right-hand steps of u and of v. Shapes (E, D, D).
+    def jacobians(self, e: Array, some: slice = slice(None)) -> tuple[Array, Array]:
+        """Return derivatives of the errors of some edges by right-hand steps of u and of v. Shapes (S, D, D).
 
         The inverse Jacobian of log is the Bernoulli series I + ad/2 + ad^2/12 - ad^4/720 + ad^6/30240, good to 1e-7
         for turns up to one radian.
         """
-        ad = _ad(e)
+        ad = _ad(e[some])
         square = ad @ ad
         even = np.eye(self.size) + square / 12.0
         if len(e) and np.abs(e[:, 3:]).max() > 0.1:
             fourth = square @ square
             even += square @ fourth / 30240.0 - fourth / 720.0
-        return even + 0.5 * ad, -(even - 0.5 * ad) @ self.turned
+        return even + 0.5 * ad, -(even - 0.5 * ad) @ self.turned[some]
 
 
 def unstack(poses: Sim3, names: Sequence[int]) -> dict[int, Sim3]:
