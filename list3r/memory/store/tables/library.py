@@ -23,8 +23,6 @@ from list3r.memory.store.rows.table import Table, batches
 
 Key = tuple[int, int]
 """(chunk id, local id)."""
-_TOGETHER = 1024
-"""Instances whose rows are read at once where all are asked for, so that a large memory takes no more room."""
 
 
 @dataclass(frozen=True)
@@ -361,8 +359,7 @@ class Anchors:
 
     def all(self) -> Iterator[dict[int, Anchor]]:
         """Yield the anchors of all instances by id, some thousand at a time."""
-        for some, _ in batches(self._rows.values("instance", "1"), _TOGETHER):
-            rows = sorted(self._rows.among("instance", some), key=lambda row: row.instance)
+        for rows in self._rows.in_batches():
             yield {row.instance: Anchor(row.chunk_id, row.S_exact_settled) for row in rows}
 
     def drop(self, instance_id: int) -> None:
@@ -395,8 +392,8 @@ class LooksTable:
 
     def all(self) -> Iterator[dict[int, Looks]]:
         """Yield the looks of all instances by id, some thousand at a time."""
-        for some, _ in batches(self._rows.values("instance", "1"), _TOGETHER):
-            yield {looks.instance: looks for looks in self._rows.among("instance", some)}
+        for rows in self._rows.in_batches():
+            yield {looks.instance: looks for looks in rows}
 
     def count(self) -> int:
         """Return of how many instances the looks are known."""
