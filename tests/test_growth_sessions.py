@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.geometry import Sim3
 from list3r.memory.library import consolidation
 from list3r.memory.library.consolidation import consolidate
@@ -73,7 +74,7 @@ def everything(store: Store) -> dict[str, object]:
     return {
         **tables(store),
         "events": events,
-        "tale": store.connection.rows("SELECT value FROM memory WHERE key = 'change_ledger'"),
+        "tale": store.connection.rows("SELECT json_remove(value, '$.stands') FROM memory WHERE key = 'change_ledger'"),
     }
 
 
@@ -141,6 +142,59 @@ def test_a_chunk_of_a_later_session_is_not_derived_as_a_whole(store: Store, whol
         consolidate(store, settings=GROW)
     assert {"moved", "removed", "added"} < {e.kind for e in store.events.all(session)}
     assert whole_runs == []
+
+
+def told_until(store: Store, session: int) -> list[object]:
+    """The rows of the events of sessions up to one."""
+    return store.connection.rows("SELECT * FROM events WHERE session_id <= ? ORDER BY 1, 2", (session,))
+
+
+@pytest.fixture
+def matched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The sessions that were matched with those before, in turn."""
+    sessions: list[int] = []
+    match = ChangeMatching.match
+
+    def watched(matching: ChangeMatching, session: int) -> None:
+        sessions.append(session)
+        match(matching, session)
+
+    monkeypatch.setattr(ChangeMatching, "match", watched)
+    monkeypatch.setattr(f"{__name__}.check", lambda *_: None)
+    return sessions
+
+
+def test_the_end_of_a_session_matches_that_session_alone(store: Store, matched: list[int]) -> None:
+    film(store, house(), FIRST)
+    film(store, house(LATER), [(1, 0.9), (1, 2.2)])
+    film(store, house(LATER), [(1, 1.4), (0, 0.7)])
+    before = told_until(store, 3)
+    film(store, house({**LATER, "thing 00": None}), [(0, 0.2), (0, 2.1)])
+    assert matched == [2, 3, 4]
+    assert told_until(store, 3) == before != []
+    assert [e.kind for e in store.events.all(4) if e.kind != "seen_again"] == ["removed"]
+
+
+def test_sessions_are_matched_again_where_chunks_of_theirs_have_moved(store: Store, matched: list[int]) -> None:
+    film(store, house(), FIRST)
+    film(store, house(LATER), [(1, 0.9), (1, 2.2)])
+    with store.transaction():
+        off = Sim3(np.asarray(1.0), np.eye(3), np.array([0.0, 0.0, 0.3]))
+        store.chunks.place({store.chunks.all(2)[0].chunk_id: off}, {store.chunks.all(2)[0].chunk_id: 1})
+    film(store, house(LATER), [(1, 1.4)])
+    assert matched == [2, 2, 3]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_happens_in_sessions_they_grow_to_what_is_derived_as_a_whole(store: Store, seed: int) -> None:
+    rng = np.random.default_rng([9, seed])
+    film(store, house(), FIRST)
+    for _ in range(4):
+        names = rng.choice([name for name in house() if name.startswith("thing")], 3, replace=False)
+        ways = rng.uniform(-0.25, 0.25, (2, 2))
+        changes = {names[0]: None, **{n: moved(n, *way) for n, way in zip(names[1:], ways.tolist(), strict=True)}}
+        visits = [(int(rng.integers(2)), float(rng.uniform(0.0, 2.2))) for _ in range(2)]
+        film(store, house(changes), visits)
 
 
 def test_an_edit_in_a_memory_of_two_sessions_tells_the_changes_again(store: Store, whole_runs: list[int]) -> None:

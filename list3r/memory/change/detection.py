@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
+from list3r.memory.change.ledger import ChangeLedger
 from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.change.places import Places
 from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
@@ -72,15 +73,14 @@ def find_changes(
     chunks: Sequence[ChunkRow],
     summaries: Mapping[int, ChunkSummary],
     settings: ChangeSettings,
+    told: ChangeLedger,
 ) -> Changes:
-    """Go through the sessions in order and find what each has changed; nothing in a memory of one session."""
+    """Go through the sessions after those that are `told` of, in order, and find what each has changed."""
     groups = [list(g) for g in found.groups]
-    sessions = sorted({c.session_id for c in chunks})
-    if len(sessions) < 2:
-        return Changes(groups, {}, {}, (), [])
     places = Places(store, groups, chunks, summaries, settings)
     matching = ChangeMatching(places, found, store.edits.constraints(), settings)
-    for session in sessions[1:]:
+    matching.go_on(told)
+    for session in sorted({c.session_id for c in chunks if c.session_id > told.session}):
         matching.match(session)
     return matching.result()
 

@@ -1,13 +1,15 @@
 """The changes as found when a session last ended, in terms of local instances, which never change.
 
 Until the next session ends it stands: its chunks come to the library by overlap alone, what had moved stays one
-instance whose box is where it was last, and what had events stays shown. Then all is found again (`change.detection`).
+instance whose box is where it was last, and what had events stays shown. Then it is found what that session has changed
+(`change.detection`). What sessions before have told stands, as long as nothing was moved or edited that they told of;
+else all of it is found again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from list3r.memory.change.records import Changes
 from list3r.memory.overlap.pair_scores import Key
@@ -37,6 +39,14 @@ class ChangeLedger:
     moved: tuple[MovedInstance, ...] = ()
     with_events: frozenset[Key] = frozenset()
     """A local instance of every instance that has an event."""
+    gone: frozenset[Key] = frozenset()
+    """A local instance of every instance that is gone,"""
+    told_gone: frozenset[Key] = frozenset()
+    """and of every one that any session told to be gone."""
+    displaced: frozenset[Key] = frozenset()
+    """A local instance at every place where something was found in the place of something else, and of that."""
+    stands: bool = False
+    """Whether the next session can be matched with what this says of those before."""
 
     @staticmethod
     def of(changes: Changes, places: Sequence[Sequence[Key]], session: int) -> ChangeLedger:
@@ -47,7 +57,30 @@ class ChangeLedger:
             if group[0] in changes.current:
                 parts = sorted({home[key] for key in group})
                 moved.append(MovedInstance(tuple(parts), parts.index(home[changes.current[group[0]][0]])))
-        return ChangeLedger(session, tuple(moved), frozenset(e.first for e in changes.events))
+        here = {g[0]: changes.current.get(g[0], g)[0] for g in changes.groups}
+        gone = frozenset(here[key] for key, state in changes.states.items() if state == "removed")
+        told_gone = frozenset(here[key] for key in changes.told_gone)
+        with_events = frozenset(e.first for e in changes.events)
+        displaced = frozenset(home[key][0] for key in changes.displaced)
+        return ChangeLedger(session, tuple(moved), with_events, gone, told_gone, displaced, stands=True)
+
+    def beside(self, before: ChangeLedger, groups: Sequence[Sequence[Key]], like: Mapping[Key, Key]) -> ChangeLedger:
+        """Return it with what an earlier ledger says of instances that are not among these groups, and with the events
+        of sessions before. `like` leads from local instances that are in no group any more to those that stand for
+        them.
+        """
+        first = _first_members(groups)
+        found = first.keys() | like.keys()
+        moved = [m for m in before.moved if found.isdisjoint(m.places[m.now])]
+        with_events = (like.get(key, key) for key in before.with_events)
+        return replace(
+            self,
+            moved=tuple(sorted([*moved, *self.moved], key=lambda m: min(m.places))),
+            with_events=self.with_events | {first.get(key, key) for key in with_events},
+            gone=self.gone | (before.gone - found),
+            told_gone=self.told_gone | (before.told_gone - found),
+            displaced=self.displaced | (before.displaced - found),
+        )
 
     def shows(self, group: Collection[Key]) -> bool:
         """Return whether a group has an event, so that it is shown however little was seen of it."""
@@ -94,12 +127,18 @@ class ChangeLedger:
         renewed = [_renewed([groups[n] for n in ns], owner.get(first)) for first, ns in parts.items()]
         out = sorted(sorted(k for n in ns for k in groups[n]) for ns in parts.values())
         moved = sorted([*absent, *(m for m in renewed if m is not None)], key=lambda m: min(m.places))
-        return out, ChangeLedger(self.session, tuple(moved), self.with_events)
+        first = _first_members(out)
+        with_events = frozenset(first.get(key, key) for key in self.with_events)
+        return out, replace(self, moved=tuple(moved), with_events=with_events)
 
     def state(self, before: str | None, group: Sequence[Key], rows: Mapping[int, ChunkRow]) -> str:
         """Return the state of an instance: the one that was told, until a later session sees it."""
         later = any(rows[k].session_id > self.session for k in {k for k, _ in group})
         return "present" if before is None or later else before
+
+
+def _first_members(groups: Iterable[Sequence[Key]]) -> dict[Key, Key]:
+    return {key: g[0] for g in groups for key in g}
 
 
 def _renewed(groups: Sequence[Sequence[Key]], before: MovedInstance | None) -> MovedInstance | None:

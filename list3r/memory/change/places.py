@@ -58,6 +58,16 @@ class GroupLooks:
     """Colours of its surface, CIE L*a*b*, lightness at half weight, in the light of the later session. Shape (N, 3)."""
 
 
+class _Shapes(dict[int, ChunkShapes]):
+    """By chunk, read when they are first asked for: most of what sessions before saw is not."""
+
+    def __init__(self, summaries: Mapping[int, ChunkSummary]) -> None:
+        self._summaries = summaries
+
+    def __missing__(self, chunk_id: int) -> ChunkShapes:
+        return self.setdefault(chunk_id, self._summaries[chunk_id].shapes)
+
+
 class Places:
     """The groups of local instances as places of instances, numbered."""
 
@@ -71,7 +81,7 @@ class Places:
     ) -> None:
         self.groups = groups
         self.rows = {c.chunk_id: c for c in chunks}
-        self.shapes: dict[int, ChunkShapes] = {k: v.shapes for k, v in summaries.items()}
+        self.shapes = _Shapes(summaries)
         self.unit = world_unit(chunks, summaries)
         self.ties = SessionTies(store.edges.all(), self.rows)
         self._upright = store.facts.gravity != "unknown"
@@ -85,6 +95,7 @@ class Places:
         self._stayed: dict[tuple[int, int], OrientedBox] = {}
         self._frames: dict[tuple[int, int], int] = {}
         self._summaries: dict[int, tuple[float, Array]] = {}
+        self._structure = store.local_instances.structure(sorted(self.rows))
         self._picture = lru_cache(_PICTURES)(self._read_picture)
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
@@ -273,10 +284,11 @@ class Places:
         return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
-        """Return the views of the sessions before, in the world of an instance, the last session first."""
+        """Return the views of the sessions before that can tell about an instance, the last session first."""
         component = self.component[n]
         earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
-        return (self._views_of(s, component) for s in sorted(earlier, reverse=True))
+        told_by = (s for s in sorted(earlier, reverse=True) if not self.out_of_sight(n, s))
+        return (self._views_of(s, component) for s in told_by)
 
     def known_before(self, n: int, session: int) -> bool:
         """Return whether an earlier session lies in the same world, so that an instance can be new to it."""
@@ -392,7 +404,7 @@ class Places:
 
     def flagged(self, n: int) -> float:
         """Return the share of its members that are flagged as structure."""
-        return float(np.mean([self.shapes[k].structure[self._at(k, i)] for k, i in self.groups[n]]))
+        return sum(key in self._structure for key in self.groups[n]) / len(self.groups[n])
 
     def frames(self, n: int, before: int) -> int:
         """Return frames of earlier sessions in which an instance was seen."""

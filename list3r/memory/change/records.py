@@ -131,6 +131,10 @@ class Changes:
     """By first member: the state of a group, where it is not `present`."""
     events: tuple[Change, ...]
     decisions: list[MergeDecision]
+    told_gone: frozenset[Key]
+    """First members of the groups that any session told to be gone."""
+    displaced: frozenset[Key]
+    """All members of what was found where something else had been, and of that."""
 
     def without(self, keys: Collection[Key]) -> Changes:
         """Return the same told of the other members of groups alone; a group of which none is left is gone."""
@@ -142,4 +146,6 @@ class Changes:
             {first[k]: state for k, state in self.states.items() if k in first},
             tuple(replace(e, first=first[e.first]) for e in self.events if e.first in first),
             self.decisions,
+            frozenset(first[key] for key in self.told_gone if key in first),
+            self.displaced - set(keys),
         )

@@ -9,8 +9,8 @@ not be looked at:
 - Points that belong to something else are decided by the cells of local instances that are new, moved or regrouped.
 - Structure and relations are decided by what lies within a few metres, which the R*Tree finds; no instance is longer
   than `MergeSettings.most_span_m`.
-- What has changed between sessions is found when one ends, of the chunks that later sessions saw and of those that see
-  the same places.
+- What has changed between sessions is found when one ends, of the chunks that it saw and of those that see the same
+  places; what sessions before told stands, unless chunks of theirs have moved or what they saw was edited.
 """
 
 from __future__ import annotations
@@ -73,6 +73,8 @@ def consolidate(
         store.derived.end_turn()
     ledger = read_ledger(store, chunks)
     carried = _carry(store, summaries, s) if ended and ledger is not None else None
+    if ledger is not None and carried is not None:
+        ledger = replace(ledger, stands=False)
     known = store.facts[WORLD]
     world = _standing_world(store, summaries, s, ended=ended)
     moved = settle(store, summaries, s.hysteresis, None if ended or world is None else _replaced(store, before))

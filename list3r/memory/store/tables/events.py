@@ -11,16 +11,16 @@ from list3r.memory.store.rows.table import Table
 
 
 class Events:
-    """The table of events, which are derived: they are written again whenever the library is."""
+    """The table of events, which are derived."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         columns = Columns.of(ChangeEvent, instance_id="instance")
         self._rows = Table(connection, "events", columns, "session_id, instance")
 
-    def replace(self, events: Iterable[ChangeEvent]) -> None:
-        """Forget all events and write these; call inside `transaction()`."""
-        self._rows.delete()
+    def replace(self, events: Iterable[ChangeEvent], after: int = 0) -> None:
+        """Forget all events of sessions `after` one and write these; call inside `transaction()`."""
+        self._rows.delete("session_id > ?", (after,))
         self._rows.put(events)
 
     def all(self, session_id: int | None = None) -> list[ChangeEvent]:

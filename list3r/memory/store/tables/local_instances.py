@@ -229,6 +229,13 @@ class LocalInstances:
         query = "SELECT local_id FROM local_instances WHERE chunk_id = ? AND dynamic ORDER BY local_id"
         return [int(n) for (n,) in self._connection.rows(query, (chunk_id,))]
 
+    def structure(self, chunk_ids: Sequence[int]) -> set[tuple[int, int]]:
+        """Return (chunk id, local id) of those of some chunks that are flagged as structure."""
+        self._connection.sound("local_instances", chunk_ids)
+        query = "SELECT chunk_id, local_id FROM local_instances WHERE structure AND chunk_id IN ({})"
+        parts = [self._connection.rows(query.format(marks), part) for part, marks in batches(chunk_ids)]
+        return {(int(k), int(n)) for rows in parts for k, n in rows}
+
     def any_dynamic(self) -> bool:
         """Return whether any local instance was seen moving."""
         return bool(self._connection.rows("SELECT 1 FROM local_instances WHERE dynamic LIMIT 1"))
