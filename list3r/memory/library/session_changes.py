@@ -103,10 +103,9 @@ class SessionChanges:
         fresh = superseded(region, still, edited_since(self._store, 0))
         region.supersede(fresh)
         self._g.left_out = fresh
-        gone = {row.key for row in (*old, *fresh)}
-        self._found = found.without(gone)
-        places = [tuple(k for k in g if k not in gone) for g in places]
         like = {row.key: row.like for row in (*old, *fresh)}
+        self._found = found.without(like)
+        places = [tuple(k for k in g if k not in like) for g in places]
         groups = [tuple(g) for g in self._found.groups]
         self._g.ledger = ChangeLedger.of(self._found, places, sessions[-1]).beside(self._told, groups, like)
         self._compared = frozenset(groups)
