@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from list3r.memory.change.ledger import ChangeLedger
 from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.geometry import Sim3
 from list3r.memory.library import consolidation
@@ -150,43 +151,60 @@ def told_until(store: Store, session: int) -> list[object]:
 
 
 @pytest.fixture
-def matched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The sessions that were matched with those before, in turn."""
+def stood(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The last session of which what was told stood, each time that changes were looked for: at the end of a session,
+    and when that is checked, which is as a whole.
+    """
     sessions: list[int] = []
-    match = ChangeMatching.match
+    go_on = ChangeMatching.go_on
 
-    def watched(matching: ChangeMatching, session: int) -> None:
-        sessions.append(session)
-        match(matching, session)
+    def watched(matching: ChangeMatching, told: ChangeLedger) -> None:
+        sessions.append(told.session)
+        go_on(matching, told)
 
-    monkeypatch.setattr(ChangeMatching, "match", watched)
-    monkeypatch.setattr(f"{__name__}.check", lambda *_: None)
+    monkeypatch.setattr(ChangeMatching, "go_on", watched)
     return sessions
 
 
-def test_the_end_of_a_session_matches_that_session_alone(store: Store, matched: list[int]) -> None:
+def test_the_end_of_a_session_matches_that_session_alone(store: Store, stood: list[int]) -> None:
     film(store, house(), FIRST)
     film(store, house(LATER), [(1, 0.9), (1, 2.2)])
     film(store, house(LATER), [(1, 1.4), (0, 0.7)])
     before = told_until(store, 3)
     film(store, house({**LATER, "thing 00": None}), [(0, 0.2), (0, 2.1)])
-    assert matched == [2, 3, 4]
+    assert stood == [1, 1, 2, 1, 3, 1]
     assert told_until(store, 3) == before != []
     assert [e.kind for e in store.events.all(4) if e.kind != "seen_again"] == ["removed"]
 
 
-def test_sessions_are_matched_again_where_chunks_of_theirs_have_moved(store: Store, matched: list[int]) -> None:
+def test_sessions_are_matched_again_where_chunks_of_theirs_have_moved(store: Store, stood: list[int]) -> None:
     film(store, house(), FIRST)
     film(store, house(LATER), [(1, 0.9), (1, 2.2)])
     with store.transaction():
-        off = Sim3(np.asarray(1.0), np.eye(3), np.array([0.0, 0.0, 0.3]))
+        off = Sim3(np.asarray(1.0), np.eye(3), np.array([0.0, 0.0, 0.015]))
         store.chunks.place({store.chunks.all(2)[0].chunk_id: off}, {store.chunks.all(2)[0].chunk_id: 1})
     film(store, house(LATER), [(1, 1.4)])
-    assert matched == [2, 2, 3]
+    assert stood == [1, 1, 1, 1]
+
+
+def test_an_edit_while_a_session_comes_in_matches_all_sessions_again(store: Store, stood: list[int]) -> None:
+    film(store, house(), FIRST)
+    film(store, house(LATER), [(1, 0.9), (1, 2.2)])
+    with store.transaction():
+        session = store.sessions.add("simulated", "later", {}, 1)
+        chunk_id = store.chunks.add(session, simulated_chunk(house(LATER), cameras((APART_M, 0.0, 0.75), 1.4), 0))
+        store.chunks.place({chunk_id: Sim3.identity()}, {chunk_id: 1})
+        consolidate(store, chunk_id, GROW)
+    del stood[:]
+    gone = next(e.instance_id for e in store.events.all(2) if e.kind == "moved")
+    edits.split(store, gone, author="somebody")
+    assert stood == [1] and gone not in [e.instance_id for e in store.events.all(2) if e.kind == "moved"]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_whatever_happens_in_sessions_they_grow_to_what_is_derived_as_a_whole(store: Store, seed: int) -> None:
+def test_whatever_happens_in_sessions_they_grow_to_what_is_derived_as_a_whole(
+    store: Store, stood: list[int], seed: int
+) -> None:
     rng = np.random.default_rng([9, seed])
     film(store, house(), FIRST)
     for _ in range(4):
@@ -194,7 +212,8 @@ def test_whatever_happens_in_sessions_they_grow_to_what_is_derived_as_a_whole(st
         ways = rng.uniform(-0.25, 0.25, (2, 2))
         changes = {names[0]: None, **{n: moved(n, *way) for n, way in zip(names[1:], ways.tolist(), strict=True)}}
         visits = [(int(rng.integers(2)), float(rng.uniform(0.0, 2.2))) for _ in range(2)]
-        film(store, house(changes), visits)
+        film(store, house(changes), visits)  # which checks it
+    assert max(stood) > 1, "no session was matched alone"
 
 
 def test_an_edit_in_a_memory_of_two_sessions_tells_the_changes_again(store: Store, whole_runs: list[int]) -> None:
