@@ -2,13 +2,14 @@
 
 PYTHONPATH=. python benchmarks/discovery_memory.py --seeds 5101-5103 --keep FOLDER --json FILE
 PYTHONPATH=. python benchmarks/discovery_memory.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
+PYTHONPATH=. python benchmarks/discovery_memory.py --seeds 5121-5126 --frames 450
 
-The worlds and the house are those of `discovery.py`, every frame filmed, so that a walk is two chunks; poses are given,
-off by a drift of some millimetres; memory and truth are laid on one another by all cameras. A thing counts from 150
-pixels with depth in a view, and its true box is that of its surface that has depth in some view: what lies beyond the
-reach of the sensor cannot be laid anywhere. `split` and `joined` are told by masks: pairs of listed instances of which
-most pixels lie on one true thing, and pairs of true things that one instance holds half of each, both for each true
-thing.
+The worlds and the house are those of `discovery.py`, every frame filmed, so that a walk of 150 frames is two chunks and
+one of 450 six; poses are given, off by a drift of some millimetres; memory and truth are laid on one another by all
+cameras. A thing counts from 150 pixels with depth in a view, and its true box is that of its surface that has depth in
+some view: what lies beyond the reach of the sensor cannot be laid anywhere. `split` and `joined` are told by masks:
+pairs of listed instances of which most pixels lie on one true thing, and pairs of true things that one instance holds
+half of each, both for each true thing.
 """
 
 from __future__ import annotations
@@ -36,8 +37,6 @@ from list3r.memory.store.store import Store
 from list3r.simulation.dataset import DEPTH_UNITS_PER_M, frame_name
 from training.worlds.film import Film, FilmSettings, make_film, reconstruction_of
 
-FRAMES = 150
-"""Of each walk: two chunks."""
 EVERY = 5
 """Frames between those whose masks are compared."""
 SENSORS = ("structured", "lidar", "tof")
@@ -49,6 +48,7 @@ def main() -> None:
     parser.add_argument("--methods", default="learned")
     parser.add_argument("--house", type=Path)
     parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
+    parser.add_argument("--frames", type=int, default=150, help="of each walk")
     parser.add_argument("--keep", type=Path, help="folder in which walks are kept")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -58,7 +58,7 @@ def main() -> None:
             kind = "house" if args.house else "fitted" if args.fitted else "world"
             walk = (args.keep or Path(scratch)) / f"{kind}-{seed}"
             if not all((walk / name).exists() for name in ("cameras.txt", "truth.json")):
-                write_film(walk, film_of(seed, args.house, fitted=args.fitted), seed)
+                write_film(walk, film_of(seed, args.house, args.frames, fitted=args.fitted), seed)
             for method in args.methods.split(","):
                 rows.append({"method": method, "seed": seed, **measured(walk, method)})
                 print(json.dumps(rows[-1]), flush=True)
@@ -66,17 +66,17 @@ def main() -> None:
     print(machine())
     for method, entry in table.items():
         print(method, json.dumps(entry))
-    write_json(args.json, {"frames": FRAMES, "mean": table, "walks": rows})
+    write_json(args.json, {"frames": args.frames, "mean": table, "walks": rows})
 
 
-def film_of(seed: int, house: Path | None, *, fitted: bool) -> Film:
+def film_of(seed: int, house: Path | None, frames: int, *, fitted: bool) -> Film:
     """The walk of a seed, all of its frames."""
     sensor = SENSORS[seed % 3]
     if house is not None:
         from training.worlds.gazebo import film_house
 
-        return film_house(house, seed, sensor, FRAMES, 1)
-    return make_film(FilmSettings(seed, held_out=True, fitted=fitted, frames=FRAMES, every=1, sensor=sensor))
+        return film_house(house, seed, sensor, frames, 1)
+    return make_film(FilmSettings(seed, held_out=True, fitted=fitted, frames=frames, every=1, sensor=sensor))
 
 
 def write_film(root: Path, film: Film, seed: int) -> None:
@@ -142,7 +142,7 @@ def measured(walk: Path, method: str) -> dict[str, Any]:
         path = Trajectory(np.array([f.time_s for f, _ in poses]), T)
     S = alignment_of(read_tum(walk / "cameras.txt"), path, with_scale=False)
     found = evaluate_scene(scene, truth, S, MIN_PX)
-    frames = range(0, FRAMES, EVERY)
+    frames = range(0, len(poses), EVERY)
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     out: dict[str, Any] = {"true": found["instances_0.25"]["true_count"], **usage}
     for tag, name in (("0.25", "0.25"), ("0.5", "0.50")):

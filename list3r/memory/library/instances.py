@@ -38,16 +38,12 @@ class DeriveSettings:
     """Share of the points left out at either end, as it is measured how flat it is."""
     flat: float = 0.15
     """Thickness over the second longest extent of what is flat."""
-    confirmed: float = 0.25
-    """Share of the members that must have a surface at a point of a small instance of at least four whole views."""
+    agreed: float = 0.8
+    """Share of the whole views of a small instance, by their frames, beyond whose own ends it has none."""
     small_m: float = 0.5
     """Diagonal of a small instance; of a larger one each chunk sees another part."""
-    whole_views: int = 4
-    """Whole views from which members vote on points,"""
     whole_share: float = 0.7
-    """where this share of the members are whole views;"""
-    least_kept: float = 0.3
-    """nothing is dropped where less than this share of the points would be kept."""
+    """Share of its members that must be whole views."""
     cut: float = 0.25
     """Weight of a view that the image's border cuts, as the best one is chosen."""
     hidden: float = 0.2
@@ -188,7 +184,7 @@ def derive_instance(
     owner = np.repeat(np.arange(len(members)), [len(k) for k in own])
     step = -(-len(points) // s.max_points)
     points, rgb, owner = points[::step], rgb[::step], owner[::step]
-    keep = _confirmed(points, owner, members, s)
+    keep = _within_ends(points, owner, members, s, upright=upright)
     points, rgb = points[keep], rgb[keep]
     keep = without_strays(points)
     points, rgb = points[keep], rgb[keep]
@@ -230,33 +226,41 @@ def _aabb(points: Array, trim: float) -> Array:
     return np.asarray(np.quantile(points, [trim, 1.0 - trim], axis=0))
 
 
-def _confirmed(
-    points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings
+def _within_ends(
+    points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings, *, upright: bool
 ) -> NDArray[np.int64]:
-    """Return points that enough of the members agree on: what a single chunk added to an instance that others saw whole
-    is a bit of something else. Members that the image's border cut have no say, and where they are many nothing is
-    dropped.
+    """Return points of an instance, along the axes of its box, up to the ends on which enough of its whole views agree.
+
+    Each chunk's depth is off in a way of its own, so what all chunks saw together is larger than what any of them saw.
+    Members that the image's border cut have no say.
     """
-    whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
-    need = int(np.ceil(s.confirmed * whole.sum()))
+    every = np.arange(len(points))
+    cut = np.array([m.shapes.truncated[m.at] >= 0.5 for m in members])
+    whole = [n for n in np.flatnonzero(~cut).tolist() if (owner == n).sum() >= _LEAST_POINTS]
     size = float(np.median([m.shapes.size[m.at] / m.shapes.unit for m in members]))
-    if whole.sum() < s.whole_views or whole.mean() < s.whole_share or need < 2 or size > s.small_m:
-        return np.arange(len(points))
-    grain = 2.0 * members[0].shapes.grain * float(members[0].S_world_chunk.scale)
-    cells = np.floor((points - points.min(axis=0)) / grain).astype(np.int64) + 1
-    shape = cells.max(axis=0) + 2
-    flat = np.ravel_multi_index(tuple(cells.T), tuple(shape))
-    reach = np.array([np.ravel_multi_index((i + 1, j + 1, k + 1), tuple(shape)) for i, j, k in _NEAR]) - int(
-        np.ravel_multi_index((1, 1, 1), tuple(shape))
-    )
-    seen = np.unique((flat[:, None] + reach) * len(members) + owner[:, None])
-    held, count = np.unique(seen[whole[seen % len(members)]] // len(members), return_counts=True)
-    at = np.minimum(np.searchsorted(held, flat), len(held) - 1)
-    keep = np.flatnonzero((held[at] == flat) & (count[at] >= need))
-    return keep if len(keep) >= s.least_kept * len(points) else np.arange(len(points))
+    if len(whole) < 2 or 1.0 - cut.mean() < s.whole_share or size > s.small_m:
+        return every
+    box = fit_box(points, upright=upright, trim=s.trim)
+    along = (points - box.center) @ box.rotation
+    ends = np.array([np.quantile(along[owner == n], [2.0 * s.trim, 1.0 - 2.0 * s.trim], axis=0) for n in whole])
+    weight = np.array([min(len(members[n].shapes.frames[members[n].at]), _MOST_FRAMES) for n in whole], np.float64)
+    low = -_weighted_quantile(-ends[:, 0], weight, s.agreed)
+    high = _weighted_quantile(ends[:, 1], weight, s.agreed)
+    keep = np.flatnonzero(((along >= low) & (along <= high)).all(axis=1))
+    return keep if len(keep) else every
 
 
-_NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
+_LEAST_POINTS, _MOST_FRAMES = 10, 30
+"""Points of a view that has a say about ends, and frames from which no more say comes."""
+
+
+def _weighted_quantile(values: Array, weight: Array, share: float) -> Array:
+    """Return the quantile of each column of values, (N, D), that weigh (N,). Shape (D,)."""
+    order = np.argsort(values, axis=0, kind="stable")
+    w = weight[order]
+    at = np.cumsum(w, axis=0) - 0.5 * w
+    ranked = np.take_along_axis(values, order, axis=0)
+    return np.array([np.interp(share * weight.sum(), at[:, d], ranked[:, d]) for d in range(values.shape[1])])
 
 
 def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:

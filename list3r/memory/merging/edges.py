@@ -51,10 +51,10 @@ class Links:
     """NONE, SAME, PART or PLANE. Shape (M,)."""
     score: Array
     """By which those that are not NONE are taken, the largest first. Shape (M,)."""
-    low: Array
-    """Share of the less covered one's surface that lies on the other. Shape (M,)."""
-    high: Array
-    """The same of the better covered one. Shape (M,)."""
+    a_on_b: Array
+    """Share of the first one's surface that lies on the second. Shape (M,)."""
+    b_on_a: Array
+    """The same of the second one. Shape (M,)."""
     cosine: Array
     """Of the features. Shape (M,)."""
     frame_iou: Array
@@ -70,8 +70,8 @@ class Links:
             starts[1] + joined([p.b for _, _, p in parts], np.int64),
             joined([p.kind for _, _, p in parts], np.int8),
             joined([p.score for _, _, p in parts], np.float64),
-            joined([p.low for _, _, p in parts], np.float64),
-            joined([p.high for _, _, p in parts], np.float64),
+            joined([p.a_on_b for _, _, p in parts], np.float64),
+            joined([p.b_on_a for _, _, p in parts], np.float64),
             joined([p.cosine for _, _, p in parts], np.float64),
             joined([p.frame_iou for _, _, p in parts], np.float64),
         )
@@ -80,15 +80,16 @@ class Links:
         """Return those of which both nodes have a new number, which is -1 for the others."""
         a, b = number[self.a], number[self.b]
         kept = np.flatnonzero((a >= 0) & (b >= 0))
-        rest = (getattr(self, name)[kept] for name in ("kind", "score", "low", "high", "cosine", "frame_iou"))
+        rest = (getattr(self, name)[kept] for name in ("kind", "score", "a_on_b", "b_on_a", "cosine", "frame_iou"))
         return Links(a[kept], b[kept], *rest)
 
     def scores_of(self, n: int) -> dict[str, float]:
         """Return the numbers of one pair, for the log."""
-        names = {"overlap": self.low, "containment": self.high, "cosine": self.cosine, "score": self.score}
+        low, high = sorted((self.a_on_b[n], self.b_on_a[n]))
+        numbers = {"overlap": low, "containment": high, "cosine": self.cosine[n], "score": self.score[n]}
         if not np.isnan(self.frame_iou[n]):
-            names["frame_iou"] = self.frame_iou
-        return {name: round(float(values[n]), 3) for name, values in names.items()}
+            numbers["frame_iou"] = self.frame_iou[n]
+        return {name: round(float(value), 3) for name, value in numbers.items()}
 
 
 def form_groups(
@@ -104,9 +105,10 @@ def form_groups(
     `tables` are the local instances of each chunk, in one frame of reference; `links` are of pairs of chunks, u <= v.
     The partition is the same in whatever order chunks and pairs are given: links are taken best first, ties by key. Two
     groups are joined unless a cannot-link pair would come together, or too many pairs across contradict it (complete
-    link), or the operator's `constraints` part them. What these link is joined afterwards, by `Constraints.joined`, so
-    that each half of it goes on attracting what looks like it. Returns the groups, each sorted, ordered by their first
-    member, and the decisions: one `merge` for each union, one `refuse` for each strong link that was not taken.
+    link), or more chunks tell them apart than see them as one, or the operator's `constraints` part them. What these
+    link is joined afterwards, by `Constraints.joined`, so that each half of it goes on attracting what looks like it.
+    Returns the groups, each sorted, ordered by their first member, and the decisions: one `merge` for each union, one
+    `refuse` for each strong link that was not taken.
     """
     if not tables:
         return [], []
@@ -154,7 +156,7 @@ def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
     wanted = (same | part | piece) & (cosine >= s.min_cosine) & ~(apart & ~both_structure)
     kind = np.where(wanted, np.where(same, SAME, np.where(part, PART, PLANE)), NONE).astype(np.int8)
     frame_iou = np.where(enough, p.frame_iou, np.nan)
-    return Links(a, b, kind, np.round(score, 6).astype(np.float64), low, high, cosine, frame_iou)
+    return Links(a, b, kind, np.round(score, 6).astype(np.float64), p.i_on_j, p.j_on_i, cosine, frame_iou)
 
 
 # ---------------------------------------------------------------------------------------------- the decision
@@ -171,20 +173,25 @@ def _enemies(t: Nodes, cannot_link: Sequence[tuple[Key, Key]]) -> list[set[int]]
 
 
 class _Overlaps:
-    """How far pairs of nodes overlap, both ways."""
+    """How far pairs of nodes overlap."""
 
     def __init__(self, links: Links, count: int) -> None:
-        code = links.a * count + links.b
+        code = np.concatenate([links.a * count + links.b, links.b * count + links.a])
         order = np.argsort(code, kind="stable")
-        self._count, self._code, self._low = count, code[order], links.low[order]
+        self._count, self._code = count, code[order]
+        self._share = np.concatenate([links.a_on_b, links.b_on_a])[order]
+
+    def on(self, x: Ints, y: Ints) -> Array:
+        """Share of the surface of each x that lies on its y; 0 for pairs that do not meet. Shapes broadcast."""
+        code = x * self._count + y
+        if len(self._code) == 0:
+            return np.zeros(code.shape)
+        at = np.minimum(np.searchsorted(self._code, code), len(self._code) - 1)
+        return np.asarray(np.where(self._code[at] == code, self._share[at], 0.0))
 
     def of(self, x: Ints, y: Ints) -> Array:
-        """Of pairs of nodes; 0 for those that do not meet. Shapes (P,) -> (P,)."""
-        if len(self._code) == 0:
-            return np.zeros(len(x))
-        code = np.minimum(x, y) * self._count + np.maximum(x, y)
-        at = np.minimum(np.searchsorted(self._code, code), len(self._code) - 1)
-        return np.asarray(np.where(self._code[at] == code, self._low[at], 0.0))
+        """The share of the less covered one of each pair."""
+        return np.minimum(self.on(x, y), self.on(y, x))
 
 
 class _Clusters:
@@ -233,6 +240,7 @@ def _join(
             continue
         against = "" if check is None else check.objection(t.keys[x], t.keys[y])
         against = against or _too_long(t, clusters, a, b, s) or _objection(t, clusters, a, b, overlaps, s)
+        against = against or _outvoted(t, clusters, a, b, overlaps, s)
         names, scores = (key_name(t.keys[x]), key_name(t.keys[y])), links.scores_of(n)
         if against:
             refused.add((a, b))
@@ -274,3 +282,31 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
     if apart.sum() > s.max_conflicts * len(compared):
         return f"{int(apart.sum())} of {len(compared)} pairs of whole views lie apart"
     return ""
+
+
+def _outvoted(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps, s: MergeSettings) -> str:
+    """Return whether more chunks tell two clusters apart than see both as one, or nothing.
+
+    A chunk with a member of either tells them apart, unless one of these covers both: half of a member of either that
+    is of another chunk and no larger. It tells nothing where its two lie on one another. Structure, which comes in
+    pieces, has no say.
+    """
+    one, other = (np.array([n for n in clusters.members[c] if not t.structure[n]], np.int64) for c in (a, b))
+    beside = t.chunk[one][:, None] == t.chunk[other]
+    if not beside.any():
+        return ""
+    cover = [[_covered(t, x, y, overlaps, s) for y in (one, other)] for x in (one, other)]
+    both = np.union1d(t.chunk[one][cover[0][0] & cover[0][1]], t.chunk[other][cover[1][0] & cover[1][1]])
+    x, y = one[np.nonzero(beside)[0]], other[np.nonzero(beside)[1]]
+    doubled = t.chunk[x[np.maximum(overlaps.on(x, y), overlaps.on(y, x)) >= s.min_containment]]
+    apart = np.setdiff1d(t.chunk[x], np.concatenate([both, doubled]))
+    told = f"chunks that tell them apart: {len(apart)}, that see them as one: {len(both)}"
+    return told if len(apart) > len(both) else ""
+
+
+def _covered(t: Nodes, x: Ints, y: Ints, overlaps: _Overlaps, s: MergeSettings) -> NDArray[np.bool_]:
+    """Return whether each of the nodes `x` covers any of `y` of another chunk, no larger than it. Shapes (X,), (Y,) ->
+    (X,).
+    """
+    asked = (t.chunk[x][:, None] != t.chunk[y]) & (t.size[x][:, None] >= t.size[y])
+    return np.asarray((asked & (overlaps.on(y[None], x[:, None]) >= s.min_containment)).any(axis=1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,11 @@ class Nodes:
     low: Array
     high: Array
     """Corners of the boxes of their points, world. Shape (N, 3) each."""
+
+    @cached_property
+    def chunk(self) -> Ints:
+        """The chunk of each. Shape (N,)."""
+        return np.array([k for k, _ in self.keys], np.int64)
 
     @staticmethod
     def of(chunks: Sequence[ChunkShapes], S_world_chunk: Mapping[int, Sim3]) -> Nodes:
