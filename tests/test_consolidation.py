@@ -117,6 +117,19 @@ def test_a_walk_becomes_one_instance_for_each_thing(tmp_path: Path) -> None:
         assert store.verify() == []
 
 
+def test_a_small_thing_is_told_as_large_as_its_whole_views_agree_on_and_a_large_one_as_all_saw_it(
+    tmp_path: Path,
+) -> None:
+    with create(tmp_path / "a.l3r") as store:
+        for k in range(5):
+            add(store, chunk(k, drift=0.0 if k < 4 else 0.04))
+        ids = named(store)
+        box, table = store.instances.get(ids["box"]), store.instances.get(ids["table"])
+        assert np.abs(box.box.size - [0.3, 0.2, 0.16]).max() < 0.02
+        assert (np.sort(np.diff(box.aabb, axis=0)[0]) - np.sort(box.box.size)).max() > 0.02
+        assert np.allclose(np.sort(np.diff(table.aabb, axis=0)[0]), np.sort(table.box.size), atol=0.01)
+
+
 def test_confidence_grows_with_evidence(tmp_path: Path) -> None:
     with create(tmp_path / "a.l3r") as store:
         add(store, chunk(0))

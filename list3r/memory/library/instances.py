@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.description.colors import Swatch, dominant_colors
 from list3r.memory.description.describe import shape_word
-from list3r.memory.geometry import Array, Sim3
+from list3r.memory.geometry import Array, OrientedBox, Sim3
 from list3r.memory.merging.movers import Mover
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.voxels import ChunkShapes
@@ -38,12 +38,18 @@ class DeriveSettings:
     """Share of the points left out at either end, as it is measured how flat it is."""
     flat: float = 0.15
     """Thickness over the second longest extent of what is flat."""
-    agreed: float = 0.8
-    """Share of the whole views of a small instance, by their frames, beyond whose own ends it has none."""
+    confirmed: float = 0.25
+    """Share of the members that must have a surface at a point of a small instance of at least four whole views."""
     small_m: float = 0.5
     """Diagonal of a small instance; of a larger one each chunk sees another part."""
+    whole_views: int = 4
+    """Whole views from which members vote on points,"""
     whole_share: float = 0.7
-    """Share of its members that must be whole views."""
+    """where this share of the members are whole views;"""
+    least_kept: float = 0.3
+    """nothing is dropped where less than this share of the points would be kept."""
+    agreed: float = 0.7
+    """Share of the whole views of a small instance, by their frames, whose own ends are no further out than its box."""
     cut: float = 0.25
     """Weight of a view that the image's border cuts, as the best one is chosen."""
     hidden: float = 0.2
@@ -80,6 +86,8 @@ class DerivedInstance:
     """A global instance before it is written."""
 
     geometry: InstanceGeometry
+    box: OrientedBox
+    """The box that is told; that of its geometry, by which it is related to others, holds all of its points."""
     feature: NDArray[np.float32]
     """Unit length. Shape (D,)."""
     frames: NDArray[np.int64]
@@ -147,7 +155,13 @@ def derived_instance(store: Store, instance_id: int, members: Members, settings:
         last = m.of([k for k in m.group if k in m.mover.last])
         now = derive_instance(instance_id, last, m.component, upright=m.upright, settings=settings)
         found = replace(
-            found, geometry=now.geometry, anchor=now.anchor, shape=now.shape, dynamic=True, resting=m.mover.resting
+            found,
+            geometry=now.geometry,
+            box=now.box,
+            anchor=now.anchor,
+            shape=now.shape,
+            dynamic=True,
+            resting=m.mover.resting,
         )
     return cache.put(key, replace(found, geometry=replace(found.geometry, stamp=next(cache.stamps))))
 
@@ -184,14 +198,15 @@ def derive_instance(
     owner = np.repeat(np.arange(len(members)), [len(k) for k in own])
     step = -(-len(points) // s.max_points)
     points, rgb, owner = points[::step], rgb[::step], owner[::step]
-    keep = _within_ends(points, owner, members, s, upright=upright)
-    points, rgb = points[keep], rgb[keep]
+    keep = _confirmed(points, owner, members, s)
+    points, rgb, owner = points[keep], rgb[keep], owner[keep]
     keep = without_strays(points)
-    points, rgb = points[keep], rgb[keep]
+    points, rgb, owner = points[keep], rgb[keep], owner[keep]
     frames = _frames(members)
     counts = np.array([m.shapes.seen_for(m.at) for m in members], dtype=np.float64)
     feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
     box = fit_box(points, upright=upright, trim=s.trim)
+    told = _agreed_box(box, points, owner, members, s, upright=upright)
     geometry = InstanceGeometry(
         id=instance_id,
         points=points,
@@ -207,7 +222,7 @@ def derive_instance(
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(geometry, unit_feature, frames, view, anchor, shape, colors)
+    return DerivedInstance(geometry, told, unit_feature, frames, view, anchor, shape, colors)
 
 
 def _frames(members: Sequence[Member]) -> NDArray[np.int64]:
@@ -226,28 +241,31 @@ def _aabb(points: Array, trim: float) -> Array:
     return np.asarray(np.quantile(points, [trim, 1.0 - trim], axis=0))
 
 
-def _within_ends(
-    points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings, *, upright: bool
-) -> NDArray[np.int64]:
-    """Return points of an instance, along the axes of its box, up to the ends on which enough of its whole views agree.
+def _agreed_box(
+    box: OrientedBox,
+    points: Array,
+    owner: NDArray[np.int64],
+    members: Sequence[Member],
+    s: DeriveSettings,
+    *,
+    upright: bool,
+) -> OrientedBox:
+    """Return the box of an instance, that of a small one up to the ends on which its whole views agree.
 
-    Each chunk's depth is off in a way of its own, so what all chunks saw together is larger than what any of them saw.
+    The depth of each chunk is off in a way of its own, so what all saw together is larger than what any of them saw.
     Members that the image's border cut have no say.
     """
-    every = np.arange(len(points))
     cut = np.array([m.shapes.truncated[m.at] >= 0.5 for m in members])
     whole = [n for n in np.flatnonzero(~cut).tolist() if (owner == n).sum() >= _LEAST_POINTS]
     size = float(np.median([m.shapes.size[m.at] / m.shapes.unit for m in members]))
     if len(whole) < 2 or 1.0 - cut.mean() < s.whole_share or size > s.small_m:
-        return every
-    box = fit_box(points, upright=upright, trim=s.trim)
+        return box
     along = (points - box.center) @ box.rotation
-    ends = np.array([np.quantile(along[owner == n], [2.0 * s.trim, 1.0 - 2.0 * s.trim], axis=0) for n in whole])
-    weight = np.array([min(len(members[n].shapes.frames[members[n].at]), _MOST_FRAMES) for n in whole], np.float64)
-    low = -_weighted_quantile(-ends[:, 0], weight, s.agreed)
-    high = _weighted_quantile(ends[:, 1], weight, s.agreed)
-    keep = np.flatnonzero(((along >= low) & (along <= high)).all(axis=1))
-    return keep if len(keep) else every
+    ends = np.array([np.quantile(along[owner == n], [s.trim, 1.0 - s.trim], axis=0) for n in whole])
+    weight = np.minimum([len(members[n].shapes.frames[members[n].at]) for n in whole], _MOST_FRAMES).astype(np.float64)
+    low, high = -_weighted_quantile(-ends[:, 0], weight, s.agreed), _weighted_quantile(ends[:, 1], weight, s.agreed)
+    inside = ((along >= low) & (along <= high)).all(axis=1)
+    return fit_box(points[inside], upright=upright, trim=s.trim) if inside.any() else box
 
 
 _LEAST_POINTS, _MOST_FRAMES = 10, 30
@@ -261,6 +279,35 @@ def _weighted_quantile(values: Array, weight: Array, share: float) -> Array:
     at = np.cumsum(w, axis=0) - 0.5 * w
     ranked = np.take_along_axis(values, order, axis=0)
     return np.array([np.interp(share * weight.sum(), at[:, d], ranked[:, d]) for d in range(values.shape[1])])
+
+
+def _confirmed(
+    points: Array, owner: NDArray[np.int64], members: Sequence[Member], s: DeriveSettings
+) -> NDArray[np.int64]:
+    """Return points that enough of the members agree on: what a single chunk added to an instance that others saw whole
+    is a bit of something else. Members that the image's border cut have no say, and where they are many nothing is
+    dropped.
+    """
+    whole = np.array([m.shapes.truncated[m.at] < 0.5 for m in members])
+    need = int(np.ceil(s.confirmed * whole.sum()))
+    size = float(np.median([m.shapes.size[m.at] / m.shapes.unit for m in members]))
+    if whole.sum() < s.whole_views or whole.mean() < s.whole_share or need < 2 or size > s.small_m:
+        return np.arange(len(points))
+    grain = 2.0 * members[0].shapes.grain * float(members[0].S_world_chunk.scale)
+    cells = np.floor((points - points.min(axis=0)) / grain).astype(np.int64) + 1
+    shape = cells.max(axis=0) + 2
+    flat = np.ravel_multi_index(tuple(cells.T), tuple(shape))
+    reach = np.array([np.ravel_multi_index((i + 1, j + 1, k + 1), tuple(shape)) for i, j, k in _NEAR]) - int(
+        np.ravel_multi_index((1, 1, 1), tuple(shape))
+    )
+    seen = np.unique((flat[:, None] + reach) * len(members) + owner[:, None])
+    held, count = np.unique(seen[whole[seen % len(members)]] // len(members), return_counts=True)
+    at = np.minimum(np.searchsorted(held, flat), len(held) - 1)
+    keep = np.flatnonzero((held[at] == flat) & (count[at] >= need))
+    return keep if len(keep) >= s.least_kept * len(points) else np.arange(len(points))
+
+
+_NEAR = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
 def _normal(members: Sequence[Member], points: Array, s: DeriveSettings) -> Array | None:

@@ -55,10 +55,10 @@ def record_of(
     return Instance(
         id=geometry.id,
         label=label,
-        description=_description(found, names, geometry.box.size, geometry.structure, world, metric=metric),
-        center=geometry.box.center,
+        description=_description(found, names, found.box.size, geometry.structure, world, metric=metric),
+        center=found.box.center,
         aabb=geometry.aabb,
-        box=geometry.box,
+        box=found.box,
         confidence=geometry.confidence,
         observations=len(found.frames),
         first_seen_s=min(seen),

@@ -105,10 +105,10 @@ def form_groups(
     `tables` are the local instances of each chunk, in one frame of reference; `links` are of pairs of chunks, u <= v.
     The partition is the same in whatever order chunks and pairs are given: links are taken best first, ties by key. Two
     groups are joined unless a cannot-link pair would come together, or too many pairs across contradict it (complete
-    link), or more chunks tell them apart than see them as one, or the operator's `constraints` part them. What these
-    link is joined afterwards, by `Constraints.joined`, so that each half of it goes on attracting what looks like it.
-    Returns the groups, each sorted, ordered by their first member, and the decisions: one `merge` for each union, one
-    `refuse` for each strong link that was not taken.
+    link), or far more chunks tell them apart than see them as one, or the operator's `constraints` part them. What
+    these link is joined afterwards, by `Constraints.joined`, so that each half of it goes on attracting what looks like
+    it. Returns the groups, each sorted, ordered by their first member, and the decisions: one `merge` for each union,
+    one `refuse` for each strong link that was not taken.
     """
     if not tables:
         return [], []
@@ -285,7 +285,8 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
 
 
 def _outvoted(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps, s: MergeSettings) -> str:
-    """Return whether more chunks tell two clusters apart than see both as one, or nothing.
+    """Return whether more than twice as many chunks tell two clusters apart as see both as one, or nothing: what one
+    chunk saw whole several may well have seen in parts.
 
     A chunk with a member of either tells them apart, unless one of these covers both: half of a member of either that
     is of another chunk and no larger. It tells nothing where its two lie on one another. Structure, which comes in
@@ -301,7 +302,7 @@ def _outvoted(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps
     doubled = t.chunk[x[np.maximum(overlaps.on(x, y), overlaps.on(y, x)) >= s.min_containment]]
     apart = np.setdiff1d(t.chunk[x], np.concatenate([both, doubled]))
     told = f"chunks that tell them apart: {len(apart)}, that see them as one: {len(both)}"
-    return told if len(apart) > len(both) else ""
+    return told if len(apart) > 2 * len(both) else ""
 
 
 def _covered(t: Nodes, x: Ints, y: Ints, overlaps: _Overlaps, s: MergeSettings) -> NDArray[np.bool_]:
