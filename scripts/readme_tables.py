@@ -17,13 +17,14 @@ from tables.association import alignment, changed, fair, kitchen, registration, 
 from tables.exports import batches, catalogue, exports, pack, receivers
 from tables.results import ROOT
 from tables.summary import summary
-from tables.things import changes, discovery, relations, walks
+from tables.things import changes, discovery, memories, relations, walks
 
 TABLES: dict[str, Callable[[], str]] = {
     "summary": summary,
     "kitchen": kitchen,
     "walks": walks,
     "discovery": discovery,
+    "memories": memories,
     "fair": fair,
     "worth": worth,
     "returns": returns,

@@ -61,8 +61,16 @@ def _ate(runs: Sequence[Any], variant: str) -> str:
 
 def _instances() -> list[list[str]]:
     worlds, house, own = (read(n)["mean"] for n in ("discovery", "discovery-house", "simulated"))
+    long = read("discovery-memory-long")["mean"]["learned"]
     return [
         ["instances, simulated homes (whole walks)", _BOXES, _found(own), "", commit("simulated")],
+        [
+            "instances, ten held-out simulated worlds (memories of 450 frames)",
+            _BOXES,
+            _found(long),
+            "",
+            commit("discovery-memory-long"),
+        ],
         [
             "instances, ten held-out simulated worlds (one chunk)",
             _BOXES,

@@ -69,6 +69,27 @@ def discovery() -> str:
     return table(["recall, precision of one chunk", *keys], rows)
 
 
+def memories() -> str:
+    """Return the table of whole memories of long walks."""
+    places = {
+        "discovery-memory-long": "10 held-out worlds",
+        "discovery-memory-long-fitted": "4 held-out rooms with built-in furniture",
+        "discovery-memory-long-house": "house modelled by others, 6 walks",
+    }
+    names = {"learned": "now", "before 0205": "the version before decision 0205, from the same chunks"}
+    rows = []
+    for file, place in places.items():
+        for method, entry in read(file)["mean"].items():
+            cells = [
+                f"{entry[f'{kind}recall_{iou}']:.2f}, {entry[f'{kind}precision_{iou}']:.2f}"
+                for kind in ("", "mask_")
+                for iou in ("0.25", "0.5")
+            ]
+            rows.append([f"{place}, {entry['things']} things: {names[method]}", *cells])
+    head = ["boxes at IoU 0.25", "at 0.5", "masks at 0.25", "masks at 0.5"]
+    return table(["recall, precision of memories of six chunks", *head], rows)
+
+
 def changes() -> str:
     """Return the table of second sessions."""
     kinds = ("moved", "removed", "added", "all")
