@@ -76,7 +76,7 @@ def built(walk: Path, kind: str, seed: int) -> Path:
     if (walk / "done").exists():
         return memory
     if kind in ("world", "held"):
-        film = film_of(seed, None, 150, fitted=False) if kind == "held" else make_film(_room(seed))
+        film = film_of(seed, None, FRAMES[kind], fitted=False) if kind == "held" else make_film(_room(seed))
         write_film(walk, film, seed)
     elif not (walk / "truth.json").exists():
         write_walk(walk, WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=FRAMES[kind]), 0)

@@ -56,7 +56,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for seed in seeds_of(args.seeds):
             kind = "house" if args.house else "fitted" if args.fitted else "world"
-            walk = (args.keep or Path(scratch)) / f"{kind}-{seed}"
+            walk = (args.keep or Path(scratch)) / f"{kind}-{seed}-{args.frames}"
             if not all((walk / name).exists() for name in ("cameras.txt", "truth.json")):
                 write_film(walk, film_of(seed, args.house, args.frames, fitted=args.fitted), seed)
             for method in args.methods.split(","):
@@ -142,7 +142,7 @@ def measured(walk: Path, method: str) -> dict[str, Any]:
         path = Trajectory(np.array([f.time_s for f, _ in poses]), T)
     S = alignment_of(read_tum(walk / "cameras.txt"), path, with_scale=False)
     found = evaluate_scene(scene, truth, S, MIN_PX)
-    frames = range(0, len(poses), EVERY)
+    frames = range(0, len(list((walk / "rgb").iterdir())), EVERY)
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     out: dict[str, Any] = {"true": found["instances_0.25"]["true_count"], **usage}
     for tag, name in (("0.25", "0.25"), ("0.5", "0.50")):

@@ -273,7 +273,9 @@ _LEAST_POINTS, _MOST_FRAMES = 10, 30
 
 
 def _weighted_quantile(values: Array, weight: Array, share: float) -> Array:
-    """Return the quantile of each column of values, (N, D), that weigh (N,). Shape (D,)."""
+    """Return the quantile of each column of values, (N, D), that weigh (N,); between two views it goes from one to the
+    other, as NumPy's does not for weights. Shape (D,).
+    """
     order = np.argsort(values, axis=0, kind="stable")
     w = weight[order]
     at = np.cumsum(w, axis=0) - 0.5 * w

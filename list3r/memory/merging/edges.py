@@ -285,8 +285,8 @@ def _objection(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlap
 
 
 def _outvoted(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps, s: MergeSettings) -> str:
-    """Return whether more than twice as many chunks tell two clusters apart as see both as one, or nothing: what one
-    chunk saw whole several may well have seen in parts.
+    """Return how many chunks tell two clusters apart and see them as one, where those are far more, or nothing: what
+    one chunk saw whole several may well have seen in parts.
 
     A chunk with a member of either tells them apart, unless one of these covers both: half of a member of either that
     is of another chunk and no larger. It tells nothing where its two lie on one another. Structure, which comes in
@@ -302,7 +302,7 @@ def _outvoted(t: Nodes, clusters: _Clusters, a: int, b: int, overlaps: _Overlaps
     doubled = t.chunk[x[np.maximum(overlaps.on(x, y), overlaps.on(y, x)) >= s.min_containment]]
     apart = np.setdiff1d(t.chunk[x], np.concatenate([both, doubled]))
     told = f"chunks that tell them apart: {len(apart)}, that see them as one: {len(both)}"
-    return told if len(apart) > 2 * len(both) else ""
+    return told if len(apart) > s.max_apart * len(both) else ""
 
 
 def _covered(t: Nodes, x: Ints, y: Ints, overlaps: _Overlaps, s: MergeSettings) -> NDArray[np.bool_]:

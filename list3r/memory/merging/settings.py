@@ -43,6 +43,8 @@ class MergeSettings:
     hidden or out of range."""
     max_conflicts: float = 0.25
     """Share of the pairs across two clusters that may contradict joining them."""
+    max_apart: float = 2.0
+    """Chunks that tell two clusters apart, for each that sees them as one, up to which they are joined."""
     max_angle_deg: float = 10.0
     """Between the normals of two pieces of one plane."""
     most_span_m: float = 20.0
