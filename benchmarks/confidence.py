@@ -2,17 +2,21 @@
 
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --world 9200-9202 --held 5101-5103 --home 61 --colour 46
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --world 9100-9116 --home 51-54,57 --colour 43,44 --fit
+PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --walks FOLDER1 FOLDER2 --fit
 
-Walks of 150 frames (`--colour`: 100) are built with nothing left out for want of confidence: `--world` rooms of the
-kind that discovery was trained on, `--held` left-out ones, both with given poses, `--home` the simulator's homes with
-a sensor's depth, `--colour` the same by colour alone. An instance is right if it is matched with a true thing by masks
-at IoU 0.5; those of things hardly in view do not count. `--fit` prints `ConfidenceWeights` fitted to all walks.
+Walks of 150 frames (`--colour`: 100; `--frames`) are built, and their libraries derived anew with nothing left out for
+want of confidence: `--world` rooms of the kind that discovery was trained on, `--held` left-out ones, both with given
+poses, `--home` the simulator's homes with a sensor's depth, `--colour` the same by colour alone, `--walks` folders that
+`discovery_memory.py` kept. An instance is right if it is matched with a true thing by masks at IoU 0.5; those of things
+hardly in view do not count. `--fit` prints `ConfidenceWeights` fitted to all walks, and how right they are in places
+left out of the fit, one in five in turn.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -30,9 +34,14 @@ from scipy.optimize import minimize
 import list3r
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import read_scene
+from list3r.memory.change.ledger import read_ledger
+from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.evidence import EvidenceSettings
-from list3r.memory.library.rules import ConsolidationSettings
-from list3r.memory.library.uncertainty import ConfidenceWeights, Signs, signs_of
+from list3r.memory.library.grouping import Grouping
+from list3r.memory.library.region import DirtySet, Region
+from list3r.memory.library.rules import WORLD, ConsolidationSettings
+from list3r.memory.library.uncertainty import ConfidenceWeights, Signs
+from list3r.memory.library.weighing import Weighing
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
@@ -42,6 +51,7 @@ from training.worlds.film import FilmSettings, make_film, varied
 KINDS = ("world", "held", "home", "colour")
 FRAMES = {"world": 150, "held": 150, "home": 150, "colour": 100}
 THRESHOLDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+FOLDS = 5
 SHRINK = 0.003
 """Penalty on the squares of weights of signs of unit variance."""
 
@@ -50,6 +60,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for kind in KINDS:
         parser.add_argument(f"--{kind}", default="", help="seeds, such as 1-3,7")
+    parser.add_argument("--walks", type=Path, nargs="*", default=[], help="folders of walks and their learned.l3r")
+    parser.add_argument("--frames", type=int, help="frames of a walk")
     parser.add_argument("--keep", type=Path, required=True, help="folder of walks and memories; what is there is kept")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
@@ -57,56 +69,61 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for kind in KINDS:
         for seed in seeds_of(getattr(args, kind)) if getattr(args, kind) else []:
-            walk = args.keep / f"{kind}-{seed}"
-            found = judged(built(walk, kind, seed), walk, kind)
-            rows.append({"kind": kind, "seed": seed, **found})
+            frames = args.frames or FRAMES[kind]
+            walk = args.keep / f"{kind}-{seed}-{frames}"
+            found = judged(built(walk, kind, seed, frames), walk, kind)
+            rows.append({"kind": kind, "seed": seed, "place": f"{kind}-{seed}", **found})
             print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
+    for walk in args.walks:
+        found = judged(walk / "learned.l3r", walk, "walk")
+        rows.append({"kind": "walk", "seed": walk.name, "place": "-".join(walk.name.split("-")[:2]), **found})
+        print(walk.name, len(found["instances"]), "instances,", found["true"], "things", flush=True)
     table = {k: summary([r for r in rows if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}
     print(machine())
     for kind, entry in table.items():
         print(kind, json.dumps(entry))
     if args.fit:
         print(fitted(rows))
+        print("left out", json.dumps(left_out(rows)))
     write_json(args.json, {"mean": table, "walks": rows})
 
 
-def built(walk: Path, kind: str, seed: int) -> Path:
+def built(walk: Path, kind: str, seed: int, frames: int) -> Path:
     """The memory of a walk, made unless it is there."""
     memory = walk / "memory.l3r"
     if (walk / "done").exists():
         return memory
     if kind in ("world", "held"):
-        film = film_of(seed, None, FRAMES[kind], fitted=False) if kind == "held" else make_film(_room(seed))
+        film = film_of(seed, None, frames, fitted=False) if kind == "held" else make_film(_room(seed, frames))
         write_film(walk, film, seed)
     elif not (walk / "truth.json").exists():
-        write_walk(walk, WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=FRAMES[kind]), 0)
-    everything = BuildSettings(library=ConsolidationSettings(evidence=EvidenceSettings(least_confidence=0.0)))
-    options, source = list3r.SourceOptions(), walk
+        write_walk(walk, WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=frames), 0)
+    settings, options, source = BuildSettings(), list3r.SourceOptions(), walk
     if kind == "colour":
         camera = WalkSettings(seed=seed, size=SIZE).camera()
         source = colour_only(walk.parent / f"{walk.name}-pictures", walk)
         options = replace(options, intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy))
-        everything = replace(everything, reconstruction="sfm")
+        settings = replace(settings, reconstruction="sfm")
     elif kind != "home":
-        everything = replace(everything, poses="given")
-    list3r.build(source, memory, options=options, settings=everything, workers=0, force=True).close()
+        settings = replace(settings, poses="given")
+    list3r.build(source, memory, options=options, settings=settings, workers=0, force=True).close()
     (walk / "done").touch()
     return memory
 
 
-def _room(seed: int) -> FilmSettings:
+def _room(seed: int, frames: int) -> FilmSettings:
     """A room of the kind that discovery was trained on, every frame of it filmed."""
     usual = varied(FilmSettings(seed, fitted=seed % 3 == 2, odd=0.5 if seed % 2 else 0.0))
-    return replace(usual, frames=FRAMES["world"], every=1, sensor=("structured", "lidar")[seed // 2 % 2])
+    return replace(usual, frames=frames, every=1, sensor=("structured", "lidar")[seed // 2 % 2])
 
 
 def judged(memory: Path, walk: Path, kind: str) -> dict[str, Any]:
     """Signs and confidence of each instance that is no structure, and whether it is right."""
-    truth = read_scene(walk / "truth.json")
+    truth, memory = read_scene(walk / "truth.json"), _with_everything(memory)
     frames = range(0, len(list((walk / "rgb").iterdir())), EVERY)
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     free = {e["id"] for e in truth["instances"] if not e["structure"]}
-    least = MIN_PX if kind in ("world", "held") else LEAST_PX
+    least = LEAST_PX if kind in ("home", "colour") else MIN_PX
     large = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= least}
     signs = _signs(memory)
     columns = [n for n, k in enumerate(overlaps.ids) if k in signs and overlaps.px[n] > 0]
@@ -121,18 +138,31 @@ def judged(memory: Path, walk: Path, kind: str) -> dict[str, Any]:
     return {"true": len(rows), "instances": out}
 
 
+def _with_everything(memory: Path) -> Path:
+    """A copy of a memory whose library leaves nothing out for want of confidence."""
+    copy = memory.with_suffix(".everything.l3r")
+    shutil.copy(memory, copy)
+    with Store.open(copy, writable=True) as store, store.transaction():
+        store.facts[WORLD] = None
+        consolidate(store, None, ConsolidationSettings(evidence=EvidenceSettings(least_confidence=0.0)))
+    return copy
+
+
 def _signs(memory: Path) -> dict[int, tuple[Signs, float]]:
     """What tells how sure each instance is that is no structure, and how sure it is."""
+    settings = ConsolidationSettings()
     with Store.open(memory) as store:
-        chunks = {k: s.shapes for k, s in chunk_summaries(store, ConsolidationSettings().shapes).items()}
-        groups: dict[int, list[tuple[int, int]]] = {}
-        for seen in store.observations.all():
-            groups.setdefault(seen.instance_id, []).append((seen.chunk_id, seen.local_id))
-        return {
-            i.id: (signs_of(groups[i.id], chunks, i.observations), i.confidence)
-            for i in store.instances.all()
-            if i.structure is None and i.id in groups
-        }
+        world, ledger = store.facts[WORLD], read_ledger(store, store.chunks.all())
+        assert world is not None and ledger is not None
+        region = Region(store, chunk_summaries(store, settings.shapes), world, settings)
+        nothing = DirtySet(frozenset(), frozenset(), {}, frozenset(), whole=False)
+        grouping = Grouping(region, nothing, ledger)
+        groups = grouping.groups_in(region.rows)
+        weighed = Weighing(grouping).weigh_only(groups)
+        owners = store.observations.owners([key for group in groups for key in group])
+        evidence = {owners[g[0]]: e for g, e in weighed.evidence.items() if g[0] in owners}
+        listed = [i for i in store.instances.all() if i.structure is None]
+        return {i.id: (e.signs, e.confidence) for i in listed if (e := evidence.get(i.id)) and e.signs}
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -162,9 +192,23 @@ def fitted(rows: Sequence[dict[str, Any]]) -> ConfidenceWeights:
 
     w = minimize(loss, np.zeros(x.shape[1] + 1)).x
     each = w[1:] / spread
-    stability, frames, area, size = (round(float(v), 2) for v in each)
+    stability, frames, area, size, found = (round(float(v), 2) for v in each)
     constant = round(float(w[0] - each @ middle), 2)
-    return replace(usual, stability=stability, frames=frames, area=area, size=size, constant=constant)
+    return replace(usual, stability=stability, frames=frames, area=area, size=size, found=found, constant=constant)
+
+
+def left_out(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """How right confidence is of each kind of walk, by weights fitted to four in five of the places, those others."""
+    places = sorted({r["place"] for r in rows})
+    out: list[dict[str, Any]] = []
+    for part in range(FOLDS):
+        apart = set(places[part::FOLDS])
+        weights = fitted([r for r in rows if r["place"] not in apart])
+        for r in (r for r in rows if r["place"] in apart):
+            told = [weights.probability(Signs(**i["signs"])) for i in r["instances"]]
+            said = [i | {"confidence": c} for i, c in zip(r["instances"], told, strict=True)]
+            out.append(r | {"instances": said})
+    return {k: summary([r for r in out if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}
 
 
 if __name__ == "__main__":

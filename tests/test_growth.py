@@ -197,6 +197,27 @@ def test_what_neighbours_of_computed_depth_miss_grows_alike(walks: ModuleType, s
     assert hidden > 0
 
 
+def test_chunks_that_give_a_place_to_several_others_make_an_instance_less_sure(store: Store) -> None:
+    from tests.test_consolidation import BOX, Piece, chunk
+
+    plate = Piece("plate", (3.0, 0.0, 0.72), (0.4, 0.3, 0.01))
+    boards = [Piece(f"board {x}", (x, 0.0, 0.72), (0.13, 1.8, 0.01), points=3000) for x in (2.865, 3.0, 3.135)]
+    for index in range(8):
+        add(store, chunk(index, [BOX], drift=0.0))
+    add(store, chunk(8, [plate], drift=0.0))
+    told = [store.instances.get(2).confidence]
+    for index in (9, 10):
+        beside = add(store, chunk(index, boards, drift=0.0))
+        told.append(store.instances.get(2).confidence)
+        check(store)
+    with store.transaction():
+        store.chunks.place({beside: Sim3(1.0, np.eye(3), np.array([0.0, 0.0, 5.0]))}, {beside: 1})
+        consolidate(store, beside, GROW)
+    told.append(store.instances.get(2).confidence)
+    check(store)
+    assert told[0] > told[1] > told[2] and told[3] == told[1]
+
+
 def test_one_floor_goes_on_under_another_id_after_a_while(walks: ModuleType, store: Store) -> None:
     for index in range(8):
         add(store, visit(walks, index, index, "corridor"))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.library.uncertainty import ConfidenceWeights, signs_of
+from list3r.memory.library.uncertainty import ConfidenceWeights, Signs, signs_of
 from list3r.memory.overlap.missed import MissedSettings, frames_beside, misses, pictures_confirm
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
 from list3r.memory.overlap.voxels import ChunkShapes, Ints
@@ -26,6 +26,8 @@ class EvidenceSettings:
     """Share of all frames that is enough in a short memory, but never fewer than three frames."""
     swallowed: float = 0.75
     """Share of its surface that another chunk gives to one other instance, to speak against it."""
+    covered: float = 0.5
+    """Share of its surface on which another chunk has instances of whatever kind, to have seen it."""
     min_agreement: float = 0.4
     """Share of the chunks that saw its place and found it too."""
     least_confidence: float = 0.3
@@ -54,8 +56,13 @@ class Evidence:
     """Those other instances (numbers of groups), the one named most first."""
     missed: int = 0
     """Chunks of computed depth that looked at it in frames they share with one that found it, and found nothing."""
+    seen: int = 0
+    """Chunks that saw its place: those that found it, missed it, gave it to another instance, or, unless its pixels in
+    shared frames tell, have instances on half of its surface."""
     confidence: float = 1.0
     """How probably it is one thing and all of it."""
+    signs: Signs | None = None
+    """What tells so."""
 
     @property
     def agreement(self) -> float:
@@ -92,6 +99,7 @@ def weigh(
     meet = PairTable.of(pairs, numbering)
     against: list[dict[int, tuple[float, int]]] = [{} for _ in groups]
     beside = frames_beside(chunks, pairs)
+    over = covered(meet, numbering, settings.covered)
     for inner, outer, cover in ((meet.a, meet.b, meet.a_on_b), (meet.b, meet.a, meet.b_on_a)):
         a, b = home[inner], home[outer]
         swallowed = np.flatnonzero((a != b) & weighed[a] & (cover >= settings.swallowed))
@@ -116,12 +124,30 @@ def weigh(
         ranked = tuple(sorted(votes, key=lambda g: (-votes[g], g)))
         asked = weighed[n] and not all(_bounds(chunks, key) for key in group)
         silent = {v for u in own for v in beside.get(u, {})} - own - against[n].keys() if asked else set()
-        missed = sum(misses(v, group, chunks, beside, settings.looks) for v in silent)
-        found = Evidence(frames[n], len(own), sum(votes.values()), ranked, missed)
+        missed = {v for v in silent if misses(v, group, chunks, beside, settings.looks)}
+        apart = {v for key in group for v in over.get(key, ()) if v not in beside.get(key[0], {})}
+        saw = len(own | against[n].keys() | missed | apart) if weighed[n] else len(own)
+        found = Evidence(frames[n], len(own), sum(votes.values()), ranked, len(missed), saw)
         if weighed[n]:
-            sure = settings.weights.probability(signs_of(group, chunks, found.frames))
-            found = replace(found, confidence=sure * found.agreement)
+            signs = signs_of(group, chunks, found.frames, found.found / found.seen)
+            sure = found.agreement if signs.structure > 0.5 else 1.0
+            found = replace(found, confidence=sure * settings.weights.probability(signs), signs=signs)
         out.append(found)
+    return out
+
+
+def covered(meet: PairTable, numbering: Numbering, least: float) -> dict[Key, list[int]]:
+    """Return the chunks that have instances on at least this share of the surface of local instances of others."""
+    chunk_of = np.array([k for k, _ in numbering.keys], np.int64)
+    inner, outer = np.concatenate([meet.a, meet.b]), np.concatenate([meet.b, meet.a])
+    cover = np.concatenate([meet.a_on_b, meet.b_on_a])
+    chunks, at = np.unique(chunk_of, return_inverse=True)
+    apart = chunk_of[inner] != chunk_of[outer]
+    code = inner[apart] * len(chunks) + at[outer[apart]]
+    share = np.bincount(code, cover[apart])
+    out: dict[Key, list[int]] = {}
+    for n in np.flatnonzero(share >= least).tolist():
+        out.setdefault(numbering.keys[n // len(chunks)], []).append(int(chunks[n % len(chunks)]))
     return out
 
 

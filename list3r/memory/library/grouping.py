@@ -28,6 +28,8 @@ class Grouping:
         self.shown_before: dict[Group, bool] = {}
         self.left_out: Sequence[RedundantInstance] = ()
         """What is in no group from now on, since later sessions saw it again."""
+        self.uncovered: Collection[Key] = ()
+        """Local instances of which much lay on one of those."""
         self._known: set[int] = set()
         self._movers: dict[Group, Mover] = {}
 

@@ -199,8 +199,10 @@ class Region:
         self.settled[chunk_id] = row
         self.rows = _Chunks(self.store.path, dict(sorted({**self.rows, chunk_id: row}.items())))
 
-    def supersede(self, instances: Sequence[RedundantInstance]) -> None:
-        """Leave out from now on local instances that later sessions saw again."""
+    def supersede(self, instances: Sequence[RedundantInstance]) -> set[Key]:
+        """Leave out from now on local instances that later sessions saw again; return those of which much lay on one
+        of these chunks, see `_much_on`.
+        """
         library, gone = self.store.library, dict[int, list[int]]()
         for row in instances:
             gone.setdefault(row.key[0], []).append(row.key[1])
@@ -212,7 +214,9 @@ class Region:
             dropped[k] = library.settled.dropped(k, len(shapes.points))[kept[shapes.owner]]
             empty |= set() if kept.any() else {k}
         stored = library.overlaps.all(sorted(gone))
-        found = {p: self._read_scores(p, blob).renumbered(*map(position.get, p)) for p, blob in stored.items()}
+        known = {p: self._read_scores(p, blob) for p, blob in stored.items()}
+        left = {key for pair, p in known.items() for key in self._much_on(pair, p)}
+        found = {pair: p.renumbered(*map(position.get, pair)) for pair, p in known.items()}
         library.overlaps.drop(p for p in stored if not empty.isdisjoint(p))
         library.overlaps.put({p: pack_scores(x) for p, x in found.items() if empty.isdisjoint(p)})
         library.redundant.supersede(instances, empty)
@@ -224,6 +228,7 @@ class Region:
         self._paired.clear()
         self._scores.clear()
         self._linked = None
+        return left
 
     def components(self, keys: Iterable[Key]) -> dict[int, int]:
         """Return the connected component of each chunk that has one of these local instances."""
@@ -233,7 +238,7 @@ class Region:
 
     def measure_overlaps(self, dirty: DirtySet) -> set[Key]:
         """Write the overlaps of dirty chunks, measured anew where one of the two has moved; return the local instances
-        of which most lay on another one, or the other way round, by what was written before.
+        of which much lay on another chunk by what was written before, see `_much_on`.
         """
         stored = self.store.library.overlaps.all(sorted(dirty.chunks))
         near = {(min(k, n), max(k, n)) for k in dirty.chunks for n in self.near(k)}
@@ -242,13 +247,19 @@ class Region:
         self._scores.clear()
         self.store.library.overlaps.drop(stored.keys() - near)
         self.store.library.overlaps.put(fresh)
-        left: set[Key] = set()
-        for u, v in stored.keys() - kept:
-            p = self._read_scores((u, v), stored[u, v])
-            most = np.maximum(p.i_on_j, p.j_on_i) >= self.settings.evidence.swallowed
-            left.update((u, int(self.shapes(u).local_id[i])) for i in p.i[most])
-            left.update((v, int(self.shapes(v).local_id[j])) for j in p.j[most])
-        return left
+        left = stored.keys() - kept
+        return {key for pair in left for key in self._much_on(pair, self._read_scores(pair, stored[pair]))}
+
+    def _much_on(self, pair: tuple[int, int], p: PairScores) -> list[Key]:
+        """Return the local instances of a pair of chunks of which most lies on one of the other chunk, or the other
+        way round, and those that it saw.
+        """
+        s, out = self.settings.evidence, list[Key]()
+        most = np.maximum(p.i_on_j, p.j_on_i) >= s.swallowed
+        for k, at, share in zip(pair, (p.i, p.j), (p.i_on_j, p.j_on_i), strict=True):
+            over = np.flatnonzero(np.bincount(at, share) >= s.covered)
+            out += [(k, int(n)) for n in self.shapes(k).local_id[np.concatenate([at[most], over])]]
+        return out
 
     def _read_scores(self, pair: tuple[int, int], blob: bytes) -> PairScores:
         """Return the scores of a pair of chunks. Raises `MemoryFileError` where they name what is not there."""

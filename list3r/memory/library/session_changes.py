@@ -101,7 +101,7 @@ class SessionChanges:
             self._told,
         )
         fresh = superseded(region, still, edited_since(self._store, 0))
-        region.supersede(fresh)
+        self._g.uncovered = region.supersede(fresh)
         self._g.left_out = fresh
         like = {row.key: row.like for row in (*old, *fresh)}
         self._found = found.without(like)

@@ -29,15 +29,19 @@ class Signs:
     """Diagonal of what one chunk saw of it."""
     structure: float
     """Share of it that its chunks took for structure."""
+    found: float = 1.0
+    """Share of the chunks that saw its place and found it."""
 
 
-def signs_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes], frames: int) -> Signs:
-    """Return the signs of a group that is seen in so many different frames."""
+def signs_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes], frames: int, found: float) -> Signs:
+    """Return the signs of a group that is seen in so many different frames, and found by this share of the chunks that
+    saw its place.
+    """
     own = [(chunks[k], int(np.searchsorted(chunks[k].local_id, n))) for k, n in group]
     weight = [max(1, c.seen_for(at)) for c, at in own]
     rows = [(c.stability[at], _area(c, at), c.size[at] / c.unit, c.structure[at]) for c, at in own]
     stability, area, size, structure = np.average(np.array(rows, np.float64), axis=0, weights=weight).tolist()
-    return Signs(stability, max(frames, 1), area, size, structure)
+    return Signs(stability, max(frames, 1), area, size, structure, found)
 
 
 def _area(chunk: ChunkShapes, at: int) -> float:
@@ -49,33 +53,36 @@ def _area(chunk: ChunkShapes, at: int) -> float:
 @dataclass(frozen=True)
 class ConfidenceWeights:
     """Log odds that a person would call an instance one thing and all of it: logistic regression on whole memories of
-    simulated walks (docs/decisions/0137-confidence-of-instances.md).
+    simulated walks (docs/decisions/0206-confidence-of-long-walks.md).
     """
 
-    stability: float = 11.2
-    frames: float = 1.46
+    stability: float = 9.17
+    frames: float = 0.55
     """Of the logarithm of the frames, up to `most_frames`."""
     most_frames: int = 100
-    area: float = 0.606
+    area: float = 0.63
     """Of the logarithm of the share of the picture, from `least_area` on."""
     least_area: float = 1e-4
-    size: float = -0.798
+    size: float = -1.12
     """Of the logarithm of the diagonal in metres, from `least_size_m` on."""
     least_size_m: float = 0.01
-    constant: float = -11.3
+    found: float = 2.81
+    """Of the logarithm of the share of the chunks that saw its place and found it."""
+    constant: float = -6.49
 
     def probability(self, signs: Signs) -> float:
         """Return the probability; of structure, which is never seen whole, how sure its chunks are."""
         if signs.structure > 0.5:
             return signs.stability
-        weights = self.stability, self.frames, self.area, self.size
+        weights = self.stability, self.frames, self.area, self.size, self.found
         odds = self.constant + sum(w * x for w, x in zip(weights, self.inputs(signs), strict=True))
         return 1.0 / (1.0 + math.exp(-odds))
 
-    def inputs(self, signs: Signs) -> tuple[float, float, float, float]:
-        """Return what stability, frames, area and size are the weights of."""
+    def inputs(self, signs: Signs) -> tuple[float, float, float, float, float]:
+        """Return what stability, frames, area, size and found are the weights of."""
         frames, area = min(signs.frames, self.most_frames), max(signs.area, self.least_area)
-        return signs.stability, math.log(frames), math.log(area), math.log(max(signs.size_m, self.least_size_m))
+        size, found = math.log(max(signs.size_m, self.least_size_m)), math.log(signs.found)
+        return signs.stability, math.log(frames), math.log(area), size, found
 
 
 def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.change.ledger import Group
 from list3r.memory.geometry import Sim3
-from list3r.memory.library.evidence import Evidence, claim_cells, contested, weigh, without_missed
+from list3r.memory.library.evidence import Evidence, claim_cells, contested, covered, weigh, without_missed
 from list3r.memory.library.grouping import Grouping, chunks_of
 from list3r.memory.library.identities import Identities, assign_ids
 from list3r.memory.overlap.missed import frames_beside
@@ -53,13 +53,15 @@ class Weighing:
 
     def weigh(self, changed: Iterable[Group], left: Collection[Key]) -> Weighed:
         """Weigh the groups that changed, those that have one of them, or a chunk that is new or moved, against them,
-        and those of members that moved chunks have `left`; whenever one of them comes to be shown or not, also those
-        that lie within it.
+        those whose place such a chunk saw, and those that moved chunks or superseded instances have `left`; whenever
+        one of them comes to be shown or not, also those that lie within it.
         """
         out = Weighed()
-        changed, left = list(changed), [k for k in left if self._region.takes_part(k)]
+        changed = list(changed)
+        left = [k for k in {*left, *self._g.uncovered} if self._region.takes_part(k)]
         self._g.look_up(k for k, _ in left)
-        wanted = {*changed, *self._against(changed), *(self._g.home[k] for k in left), *self._looked_at()}
+        wanted = {*changed, *self._against(changed), *(self._g.home[k] for k in left)}
+        wanted |= self._looked_at() | self._covered()
         while True:
             fresh = sorted(wanted - out.evidence.keys())
             if not fresh:
@@ -107,6 +109,16 @@ class Weighing:
             seen = [len(np.intersect1d(frames, shared)) > 0 for frames in shapes[k].frames]
             out |= {self._g.home[k, int(n)] for n in shapes[k].local_id[seen]}
         return out
+
+    def _covered(self) -> set[Group]:
+        """Return groups on whose surface a dirty chunk has instances, so that it saw their place."""
+        dirty = self._g.dirty.chunks
+        pairs = self._region.pairs_of(dirty)
+        chunks = {k for pair in pairs for k in pair}
+        self._g.look_up(chunks)
+        numbering = Numbering({k: self._region.shapes(k) for k in chunks})
+        over = covered(PairTable.of(pairs, numbering), numbering, self._region.settings.evidence.covered)
+        return {self._g.home[key] for key, found in over.items() if not dirty.isdisjoint(found)}
 
     def _against(self, groups: Collection[Group]) -> set[Group]:
         """Return groups of which a member lies on a member of one of these."""
