@@ -44,7 +44,7 @@ class Samples:
     normals: Floats
     """Unit. Shape (N, 3)."""
     gray: Floats | None = None
-    """Brightness, 0 to 255. Shape (N,)."""
+    """Brightness, as that of a view. Shape (N,)."""
 
     def laid_out(self) -> tuple[Floats, Floats, Floats]:
         """Points, normals and brightness as compiled loops read them."""

@@ -86,9 +86,11 @@ class OdometrySettings:
     most_looseness_m: float = 0.02
     """Largest standard deviation of the worst determined motion, at the median depth: guards against bare walls."""
     doubt: float = 0.85
-    """A frame whose inliers fall below this share of the usual is searched for as well."""
+    """A frame whose inliers fall below this share of the usual is searched for as well,"""
+    doubt_brightness: float = 0.9
+    """and one whose correlation of brightness falls below this share of the usual."""
     forget: float = 0.98
-    """What remains of the usual share of inliers from one frame to the next that has less."""
+    """What remains of what is usual from one frame to the next that has less."""
     most_speed_m_per_s: float = 3.0
     most_turn_deg_per_s: float = 360.0
     gap_s: float = 0.15

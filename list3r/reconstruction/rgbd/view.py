@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ class WorkingFrame:
     valid: NDArray[np.bool_]
     """Where depth and normal are both known. Shape (h, w)."""
     gray: Floats
-    """Brightness, 0 to 255. Shape (h, w)."""
+    """Brightness, see `tones`. Shape (h, w)."""
 
     @cached_property
     def known_share(self) -> float:
@@ -45,6 +46,10 @@ class WorkingFrame:
     def middle_depth(self) -> float:
         """Median of the depth that is known, metres."""
         return float(np.median(self.depth[self.depth > 0]))
+
+
+_DARK = np.float32(24.0)
+_SCALE = np.float32(128.0) + _DARK
 
 
 @lru_cache(maxsize=8)
@@ -141,4 +146,12 @@ def make_view(color: NDArray[np.uint8], depth: Floats, camera: Camera, noise: Se
     gray = cv2.cvtColor(
         cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
     )
-    return WorkingFrame(camera, small, points, normals, valid, gray.astype(np.float32))
+    return WorkingFrame(camera, small, points, normals, valid, tones(gray))
+
+
+def tones(gray: NDArray[Any]) -> Floats:
+    """Return brightness on a logarithmic scale, to which another exposure adds the same everywhere. Shape (h, w).
+
+    Its unit is a grey level at middle grey; below `_DARK` grey levels noise is most of what differs.
+    """
+    return np.asarray(_SCALE * np.log1p(gray.astype(np.float32) / _DARK), np.float32)
