@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -118,6 +119,21 @@ def walk(count: int, speed: float = 1.0, start: float = 0.0) -> np.ndarray:
 def frames_along(poses: np.ndarray, step_s: float = 1 / 30, **more: object) -> list[Frame]:
     """Frames at poses, one each `step_s` seconds."""
     return [render(T, index=k, time_s=k * step_s, **more) for k, T in enumerate(poses)]  # type: ignore[arg-type]
+
+
+def along_a_striped_wall(
+    x_m: Sequence[float], contrast: float, period_m: float, dark: float, gains: Sequence[float] | None = None
+) -> tuple[list[Frame], np.ndarray]:
+    """Frames at places along a wall with stripes, nine a second, of which each has a gain of its own, and poses."""
+    poses = np.tile(np.eye(4), (len(x_m), 1, 1))
+    poses[:, 0, 3], poses[:, 2, 3] = x_m, 1.8
+    out = []
+    for k, frame in enumerate(frames_along(poses, step_s=1 / 9, contrast=contrast, boxes=())):
+        assert frame.depth is not None
+        across = x_m[k] + frame.depth * _rays()[..., 0] - ROOM[0][0]
+        stripe = np.where(across % period_m < 0.5 * period_m, 1.0, dark) * (1.0 if gains is None else gains[k])
+        out.append(replace(frame, color=np.clip(frame.color * stripe[..., None], 0, 255).astype(np.uint8)))
+    return out, poses
 
 
 def black(frame: Frame) -> Frame:

@@ -21,7 +21,7 @@ from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import sense
-from tests.rgbd_scenes import CAMERA, black, frames_along, pose_errors, render, walk
+from tests.rgbd_scenes import CAMERA, along_a_striped_wall, black, frames_along, pose_errors, render, walk
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +131,23 @@ def test_a_motion_that_nothing_foretells_is_searched_for(numbers: tuple[int, ...
         sensed = sense(renderer.render(poses[k]), settings.sensor, settings.seed, k, float(time_s[k]))
         frames.append(Frame(k, float(time_s[k]), sensed.color, sensed.depth, None))
     shift, _ = pose_errors(RgbdReconstructor()(frames, camera).T_chunk_cam, poses[list(numbers)])
+    assert shift.max() < 0.005
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.2])
+def test_another_exposure_moves_nothing(gain: float) -> None:
+    frames, poses = along_a_striped_wall([0.0] * 4, 0.2, 0.9, 0.6, [1.0, 1.0, 1.0, gain])
+    result = RgbdReconstructor()(frames, CAMERA)
+    shift, turn = pose_errors(result.T_chunk_cam, poses)
+    assert result.posed.all()
+    assert shift.max() < 0.0005 and turn.max() < 0.05
+
+
+@pytest.mark.parametrize(("contrast", "period_m", "dark"), [(0.3, 0.1, 0.8), (0.6, 0.12, 0.5), (1.0, 0.15, 0.5)])
+def test_a_pattern_that_repeats_does_not_lead_astray(contrast: float, period_m: float, dark: float) -> None:
+    """The camera turns back, and the wall looks much the same where it is expected, a period away."""
+    frames, poses = along_a_striped_wall([-0.1, -0.05, 0.0, 0.05, 0.1, 0.05, 0.0], contrast, period_m, dark)
+    shift, _ = pose_errors(RgbdReconstructor()(frames, CAMERA).T_chunk_cam, poses)
     assert shift.max() < 0.005
 
 
