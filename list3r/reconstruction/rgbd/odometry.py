@@ -41,14 +41,18 @@ class TrackedSegment:
     """Positions."""
     usual_inliers: float = 0.0
     """Share of inliers that the last frames had."""
-    usual_correlation: float = 0.0
-    """Correlation of brightness that they had."""
+    usual_agreement: float = 0.0
+    """That share times how much brightness was alike, see `_alike`."""
 
 
-def _agreement(found: FrameRegistration) -> float:
-    """Return how much of the model a registration explains, by depth and, where there is texture, by brightness."""
-    alike = 1.0 if np.isnan(found.correlation) else max(found.correlation, 0.0)
-    return found.overlap * found.inliers * alike
+def _alike(found: FrameRegistration) -> float:
+    """Return how much brightness is alike, 0 to 1; 1 without texture."""
+    return 1.0 if np.isnan(found.correlation) else max(found.correlation, 0.0)
+
+
+def _explained(found: FrameRegistration) -> float:
+    """Return how much of the model a registration explains, in depth and brightness."""
+    return found.overlap * found.inliers * _alike(found)
 
 
 class _LookCloserError(Exception):
@@ -240,9 +244,9 @@ class CameraTracker:
                 self._unsure.add(position)
         if not possible:
             return None if given is None else given.T_model_cam
-        best, forget = max(possible, key=_agreement), self.settings.forget
+        best, forget = max(possible, key=_explained), self.settings.forget
         segment.usual_inliers = max(best.inliers, forget * segment.usual_inliers)
-        segment.usual_correlation = max(np.nan_to_num(best.correlation), forget * segment.usual_correlation)
+        segment.usual_agreement = max(best.inliers * _alike(best), forget * segment.usual_agreement)
         return best.T_model_cam
 
     def _believed(self, segment: TrackedSegment, given: PosePrior, found: FrameRegistration) -> bool:
@@ -259,10 +263,8 @@ class CameraTracker:
         )
 
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
-        """Return whether depth or brightness agree much less than in the frames before, as in a false minimum."""
-        if found is None or found.inliers < self.settings.doubt * segment.usual_inliers:
-            return True
-        return found.correlation < self.settings.doubt_brightness * segment.usual_correlation
+        """Return whether depth and brightness agree much less than in the frames before, as in a false minimum."""
+        return found is None or found.inliers * _alike(found) < self.settings.doubt * segment.usual_agreement
 
     def _given(self, segment: TrackedSegment, last: int, position: int, gap_s: float) -> PosePrior | None:
         """Where the source's own poses put the frame; None where they say nothing or a motion that cannot be."""
@@ -360,7 +362,7 @@ class CameraTracker:
         blind = self._sweep(segment, last, position) if nearby else []
         placed += [self._place(segment, position, T) for T in left]
         placed += [self._place(segment, position, T, blind=True) for T in blind]
-        return max((p for p in placed if p is not None), key=_agreement, default=None)
+        return max((p for p in placed if p is not None), key=_explained, default=None)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from motions that a slow video makes between frames."""

@@ -86,9 +86,7 @@ class OdometrySettings:
     most_looseness_m: float = 0.02
     """Largest standard deviation of the worst determined motion, at the median depth: guards against bare walls."""
     doubt: float = 0.85
-    """A frame whose inliers fall below this share of the usual is searched for as well,"""
-    doubt_brightness: float = 0.9
-    """and one whose correlation of brightness falls below this share of the usual."""
+    """A frame that agrees less than this share of what is usual, in depth times brightness, is searched for as well."""
     forget: float = 0.98
     """What remains of what is usual from one frame to the next that has less."""
     most_speed_m_per_s: float = 3.0
