@@ -1,7 +1,7 @@
 """How well and how fast the rgbd reconstruction follows a camera, without loops.
 
 PYTHONPATH=. python benchmarks/odometry.py --seeds 7301-7340 --json benchmarks/results/odometry.json
-PYTHONPATH=. python benchmarks/odometry.py --house FOLDER/aws-robomaker-bookstore-world --seeds 1-4
+PYTHONPATH=. python benchmarks/odometry.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-6
 PYTHONPATH=. python benchmarks/odometry.py --source .../redkitchen [--beside-open3d]
 
 Walks of 120 frames, nine a second, through left-out rooms of `training/worlds` or the house, with a sensor's noise and
