@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.frames.source import open_source
-from list3r.memory.errors import TrackingError
+from list3r.memory.errors import SourceError, TrackingError
 from list3r.reconstruction.poses import angle_deg
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from training.worlds.film import FilmSettings, frames_of, make_film
@@ -69,6 +69,10 @@ def main() -> None:
         for name, method in methods.items():
             rows.append({"method": name, "walk": walk.name, **measure(walk, method)})
             print(json.dumps(rows[-1]), flush=True)
+    if not any(r["compared"] for r in rows):
+        raise SystemExit(
+            "no walk has frames with a pose to compare; is there depth, and does the source know its poses?"
+        )
     table = {name: summary([r for r in rows if r["method"] == name]) for name in methods}
     print(machine())
     print(json.dumps(table, indent=1))
@@ -82,7 +86,11 @@ def filmed(seeds: Sequence[int], house: Path | None) -> Iterator[Walk]:
         if house is not None:
             from training.worlds.gazebo import film_house
 
-            film = film_house(house, seed, sensor, FRAMES, 1)
+            try:
+                film = film_house(house, seed, sensor, FRAMES, 1)
+            except SourceError as error:
+                print(error, flush=True)
+                continue
         else:
             film = make_film(FilmSettings(seed, held_out=True, frames=FRAMES, every=1, sensor=sensor))
         yield Walk(f"{seed} {sensor}", frames_of(film), film.camera, film.T_world_cam)
@@ -92,7 +100,8 @@ def chunks_of(path: Path) -> Iterator[Walk]:
     """The chunks of a source."""
     source = open_source(path)
     camera, missing = source.info.camera, np.full((4, 4), np.nan)
-    assert camera is not None
+    if camera is None:
+        raise SystemExit(f"{path} does not tell its camera; give frames with depth, poses and a camera")
     for span in plan_chunks(source.info.frame_count, ChunkSettings()):
         frames = [f for f in source.read(span.start, span.stop) if isinstance(f, Frame)]
         poses = np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])
@@ -150,8 +159,8 @@ def measure(walk: Walk, method: Callable[[Walk], tuple[Poses, NDArray[np.bool_]]
         "posed": int(posed.sum()),
         "compared": len(shift),
         "slipped": int((np.array(shift) > SLIP_M).sum()),
-        "worst_m": round(max(shift, default=float("nan")), 4),
-        "worst_deg": round(max(turn, default=float("nan")), 3),
+        "worst_m": round(max(shift), 4) if shift else None,
+        "worst_deg": round(max(turn), 3) if turn else None,
         "median_m": round(float(np.median(shift)), 5) if shift else None,
         "median_deg": round(float(np.median(turn)), 4) if turn else None,
         "cpu_ms_per_frame": round(1000 * spent / len(T), 1),

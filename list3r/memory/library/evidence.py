@@ -143,10 +143,10 @@ def covered(meet: PairTable, numbering: Numbering, least: float) -> dict[Key, li
     cover = np.concatenate([meet.a_on_b, meet.b_on_a])
     chunks, at = np.unique(chunk_of, return_inverse=True)
     apart = chunk_of[inner] != chunk_of[outer]
-    code = inner[apart] * len(chunks) + at[outer[apart]]
-    share = np.bincount(code, cover[apart])
+    code, met = np.unique(inner[apart] * len(chunks) + at[outer[apart]], return_inverse=True)
+    share = np.bincount(met, cover[apart])
     out: dict[Key, list[int]] = {}
-    for n in np.flatnonzero(share >= least).tolist():
+    for n in code[share >= least].tolist():
         out.setdefault(numbering.keys[n // len(chunks)], []).append(int(chunks[n % len(chunks)]))
     return out
 
