@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.association.graph.pose_graph import optimize
+from list3r.association.graph.pose_graph import contradicted, optimize
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
@@ -78,6 +78,14 @@ def test_false_loops_are_switched_off() -> None:
     assert result.edges[-1].weight == 0.0
     difference = errors(result.S_graph_chunk, [clean.S_graph_chunk[k] for k in range(20)])
     assert difference.max() < 0.02
+
+
+def test_a_loop_that_is_believed_again_says_what_geometry_said_of_it() -> None:
+    truth = circle(20)
+    loops = [replace(edge(truth, k, 19 - k, "loop"), reason=f"loop {k} agrees") for k in range(3)]
+    doubted = [replace(e, reason=contradicted(e, 5.0), accepted=False, scores=e.scores | {"trust": 0.0}) for e in loops]
+    result = optimize(range(20), drifting(truth) + doubted, {}, metric=True)
+    assert [(e.accepted, e.reason) for e in result.edges[-3:]] == [(True, f"loop {k} agrees") for k in range(3)]
 
 
 def test_a_rejected_loop_is_tried_again_and_geometry_has_the_last_word() -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.association.graph.chunk_nodes import NodeSettings
 from list3r.association.graph.growth import extend
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
@@ -48,16 +49,19 @@ def place_chunks(
     edges = hold_back(measured, session_of, _metre(chunks), how.ties)
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
-    weighed = counted_once(edges, session_of)
     fitted = new is not None and len(chunks) > how.solved_whole
+    once = counted_once(edges, session_of)
+    turning = set() if metric else _turning(store, chunks, once)
+    weighed = _turned(store, once, turning, how.nodes, new if fitted else None)
     if new is not None and fitted:
         graph = extend(new, ids, weighed, _placed(store, chunks, weighed, new), metric, how.graph)
     else:
         graph = optimize(ids, weighed, _graph_poses(store), metric=metric, settings=how.graph)
+    graph = _with_covariances(graph, once) if turning else graph
     judged = [_as_stated(after, own) for after, own in zip(graph.edges, edges, strict=True)]
     store.edges.add(after for before, after in zip(measured, judged, strict=True) if after is not before)
     if bend:
-        graph = _straightened(store, graph, chunks, metric, how)
+        graph = _straightened(store, graph, chunks, metric, how, turning)
     elif new is not None and how.nodes.enabled:
         _look_ahead(store, graph, new, metric, how)
         if fitted and metric:
@@ -75,6 +79,28 @@ def place_chunks(
     store.facts.S_world_graph = S_world_graph
     store.facts.gravity = gravity.status
     store.chunks.place({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
+
+
+def _turning(store: Store, chunks: Sequence[ChunkRow], edges: Sequence[Edge]) -> set[int]:
+    """Chunks that structure from motion mapped one by one, which lose scale where their camera turns."""
+    follow = {k: knows_cameras(store, k) and not poses_given(store, k) for k in {c.session_id for c in chunks}}
+    alone = {c.chunk_id for c in chunks if c.scale_kind != "metric" and follow[c.session_id]}
+    return alone - {chunk for e in edges if in_one_frame(e) for chunk in (e.u, e.v)}
+
+
+def _turned(
+    store: Store, edges: Sequence[Edge], turning: Collection[int], nodes: NodeSettings, only: int | None
+) -> Sequence[Edge]:
+    """The edges, or `only` those of one chunk, with the scale that is lost where the camera turned."""
+    if not turning:
+        return edges
+    samples = SampledChunks.of(store)
+    return [samples.turned(e, turning, nodes.frames) if only is None or only in (e.u, e.v) else e for e in edges]
+
+
+def _with_covariances(graph: GraphResult, stated: Sequence[Edge]) -> GraphResult:
+    """The graph whose edges have the covariances of others."""
+    return replace(graph, edges=tuple(_as_stated(e, own) for e, own in zip(graph.edges, stated, strict=True)))
 
 
 def _as_stated(judged: Edge, own: Edge) -> Edge:
@@ -96,6 +122,7 @@ def _straightened(
     chunks: Sequence[ChunkRow],
     metric: bool,
     how: AssociationSettings,
+    turning: Collection[int],
 ) -> GraphResult:
     """The graph with the bending of chunks undone; chunks whose poses were given do not bend, nor do those that were
     mapped together."""
@@ -104,7 +131,7 @@ def _straightened(
     rigid |= {chunk for e in graph.edges if in_one_frame(e) for chunk in (e.u, e.v)}
     bends: dict[int, Bend] = {}
     if len(rigid) < len(chunks):
-        graph, bends = bend_chunks(SampledChunks.of(store), graph, rigid, metric, how.nodes, how.graph)
+        graph, bends = bend_chunks(SampledChunks.of(store), graph, rigid, metric, how.nodes, how.graph, turning)
     if not metric and not rigid and all(knows_cameras(store, k) for k in {c.session_id for c in chunks}):
         graph, bends = place_by_surfaces(SampledChunks.of(store), graph, bends, how.surfaces)
     store.bends.replace(bends)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.edge_information import about
+from list3r.association.graph.turns import lost_scale
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
@@ -66,6 +67,9 @@ class ChunkNodes:
     """How far that is from the camera. Shape (N,)."""
     count: Ints
     """Frames of each node. Shape (N,)."""
+    turns: Array
+    """Covariance of a node's similarity as the next one sees it, by scale that is lost where the camera turns, if
+    structure from motion followed it. Shape (N - 1, 7, 7)."""
 
     @staticmethod
     def of(samples: FrameSamples, length: int) -> ChunkNodes:
@@ -85,7 +89,17 @@ class ChunkNodes:
             center=np.stack([mean(center[:, k]) for k in range(3)], axis=1),
             reach=mean(reach),
             count=count.astype(np.int64),
+            turns=_turns(samples.T_chunk_cam, reach, node),
         )
+
+    @property
+    def middle(self) -> int:
+        """The node in the middle of the chunk's posed frames."""
+        return int(self.node[len(self.node) // 2])
+
+    def turned(self, a: int, b: int) -> Array:
+        """Return the covariance of one node's similarity as another one sees it, by turns between. Shape (7, 7)."""
+        return np.asarray(self.turns[min(a, b) : max(a, b)].sum(axis=0))
 
     def nearest(self, frame: int) -> int:
         """Return the node of the posed frame nearest to a frame."""
@@ -191,6 +205,17 @@ def walk_covariance(nodes: ChunkNodes, first: int, walk: Array) -> Array:
     back = about(center[None])[0]
     variance = np.repeat(walk * [reach**2, 1.0, 1.0], [3, 3, 1]) * float(nodes.at[first + 1] - nodes.at[first])
     return np.asarray(back @ np.diag(variance) @ back.T)
+
+
+def _turns(T_chunk_cam: Array, reach: Array, node: Ints) -> Array:
+    """Return `ChunkNodes.turns`: what each step between the middles of two nodes adds, about its camera."""
+    starts = np.searchsorted(node, np.arange(int(node.max(initial=0)) + 2))
+    if len(starts) < 3:
+        return np.zeros((0, 7, 7))
+    steps = np.zeros((len(node) - 1, 7))
+    steps[:, :3], steps[:, 6] = -T_chunk_cam[:-1, :3, 3], 1.0
+    each = lost_scale(T_chunk_cam, reach)[:, None, None] * steps[:, :, None] * steps[:, None, :]
+    return np.asarray(np.add.reduceat(each[: (starts[-2] + starts[-1]) // 2], (starts[:-2] + starts[1:-1]) // 2))
 
 
 def _depth(T_chunk_cam: Array, points: NDArray[np.float32]) -> Array:

@@ -70,11 +70,12 @@ def bend_chunks(
     metric: bool,
     settings: NodeSettings | None = None,
     weights: GraphSettings | None = None,
+    turning: Collection[int] = (),
 ) -> tuple[GraphResult, dict[int, Bend]]:
     """Return the graph with every chunk where its nodes are on average, and the bend of each chunk.
 
-    The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given); chunks
-    without posed frames have no bend.
+    The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given), `turning`
+    ones lose scale where their camera turns; chunks without posed frames have no bend.
     """
     chosen = settings or NodeSettings()
     known = graph.S_graph_chunk
@@ -83,7 +84,7 @@ def bend_chunks(
         return graph, {}
     pieces = pieces_of(chunks, sorted(graph.S_graph_chunk), believed, rigid, chosen)
     start = [graph.S_graph_chunk[c] for c, nodes in pieces.nodes.items() for _ in nodes.at]
-    problem = _problem(pieces, believed, graph.components, metric, chosen, weights or GraphSettings())
+    problem = _problem(pieces, believed, graph.components, metric, chosen, weights or GraphSettings(), turning)
     placed = problem.solve(stack(start), np.ones(len(problem.u)), _STEPS)
     return _settled(placed, pieces.nodes, graph, rigid)
 
@@ -109,6 +110,7 @@ def _problem(
     metric: bool,
     settings: NodeSettings,
     weights: GraphSettings,
+    turning: Collection[int],
 ) -> GraphProblem:
     """Lay out all nodes and all that ties them."""
     first = pieces.first
@@ -125,7 +127,8 @@ def _problem(
     walk = np.maximum(walk + np.array([settings.shift_walk, settings.turn_walk, 0.0]) ** 2, settings.least_walk**2)
     for chunk, nodes in pieces.nodes.items():
         for k in range(len(nodes.at) - 1):
-            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), walk_covariance(nodes, k, walk))
+            bent = walk_covariance(nodes, k, walk) + (nodes.turns[k] if chunk in turning else 0.0)
+            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), bent)
     tied = set()
     for edge, relations in pieces.relations:
         relations = relations.rigid() if metric else relations

@@ -26,6 +26,9 @@ from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
 
+_ALONE = " (geometry alone: "
+"""What stands between why the graph does not believe an edge and what was said of it before."""
+
 
 @dataclass(frozen=True)
 class GraphSettings:
@@ -87,7 +90,7 @@ def optimize(
     weights = np.delete(weights, weak, axis=0)
     for n in reversed(weak):
         scores = {**active[n].scores, "trust": 0.0}
-        reason = f"too uncertain beside the other edges (geometry alone: {active[n].reason})"
+        reason = f"too uncertain beside the other edges{_ALONE}{active[n].reason})"
         reason = active[n].reason if "trust" in active[n].scores and not active[n].accepted else reason
         out[used[n]] = replace(active[n], weight=0.0, accepted=False, scores=scores, reason=reason)
         del used[n], active[n]
@@ -262,7 +265,8 @@ def _judged(edge: Edge, strength: float, square: float, found: TrustedGraph, n: 
     factor = float(found.factors[int(edge.kind != "adjacent")])
     scores = {**edge.scores, "trust": trust, "graph_residual": deviations, "variance_factor": factor}
     if trusted:
-        return replace(edge, weight=strength, accepted=True, scores=scores)
+        reason = edge.reason.partition(_ALONE)[2].removesuffix(")") or edge.reason
+        return replace(edge, weight=strength, accepted=True, scores=scores, reason=reason)
     already = "trust" in edge.scores and not edge.accepted
     reason = contradicted(edge, deviations)
     return replace(edge, weight=0.0, accepted=False, scores=scores, reason=edge.reason if already else reason)
@@ -275,4 +279,4 @@ def deviations_of(square: float) -> float:
 
 def contradicted(edge: Edge, deviations: float) -> str:
     """Return why a loop is not believed."""
-    return f"the rest of the graph contradicts it by {deviations:.1f} deviations (geometry alone: {edge.reason})"
+    return f"the rest of the graph contradicts it by {deviations:.1f} deviations{_ALONE}{edge.reason})"

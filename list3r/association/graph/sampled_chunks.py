@@ -3,7 +3,7 @@ that two chunks hold."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Collection, Hashable
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from list3r.association.graph.chunk_nodes import (
     relate_frames,
     ties_of,
 )
+from list3r.association.graph.solver import adjoint
 from list3r.memory.records import Edge, FrameSamples
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
@@ -97,6 +98,22 @@ class SampledChunks:
         found = self._ties.get(key)
         return found if found is not None else self._ties.put(key, tuple(ties_of(relations, edge, *nodes, settings)))
 
+    def turned(self, edge: Edge, turning: Collection[int], length: int) -> Edge:
+        """Return an edge as the middles of its chunks see it: with the scale that `turning` ones lose between there and
+        the frames that the edge stands on."""
+        if edge.covariance is None or not (edge.u in turning or edge.v in turning):
+            return edge
+        u, v = self.nodes(edge.u, length), self.nodes(edge.v, length)
+        shared = int(u.at[-1] + v.at[0]) // 2
+        at_u, at_v = edge.frames or (shared, shared)
+        covariance = edge.covariance
+        if edge.u in turning:
+            covariance = covariance + u.turned(u.middle, u.nearest(at_u))
+        if edge.v in turning:
+            moved = adjoint(edge.S_v_u.inverse())
+            covariance = covariance + moved @ v.turned(v.middle, v.nearest(at_v)) @ moved.T
+        return replace(edge, covariance=covariance)
+
     def _stamp(self, chunk: int) -> int:
         if chunk not in self._stamps:
             self._stamps[chunk] = 0 if self._store is None else self._store.chunks.checksum(chunk)
@@ -118,7 +135,7 @@ class SampledChunks:
 def _one_node() -> ChunkNodes:
     """Return a chunk that shows nothing."""
     zero, none = np.zeros(1), np.zeros(1, np.int64)
-    return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64))
+    return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64), np.zeros((0, 7, 7)))
 
 
 def _bytes_of(found: ChunkNodes | FrameRelations) -> int:
