@@ -106,7 +106,7 @@ def build_maps(
     for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
         made = _grown(work, pair)
         maps = [found for found, _ in made]
-        own = [(_without_beside(found, problem), model) for found, model in made]
+        own = [(without_beside(found, problem), model) for found, model in made]
         own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
         grown.append([found for found, _ in own])
         models |= {id(found): model for found, model in own}
@@ -178,9 +178,16 @@ def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, A
 
 def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
     """Return a map that was grown roughly, adjusted as a whole; as it is where too little would be left of it."""
-    settings = work.settings
-    if not settings.rough_iterations:
+    if not work.settings.rough_iterations:
         return found
+    whole = _adjust(work, model)
+    own = without_beside(whole, work.problem)
+    return own if _enough(whole, work.settings) and len(own.T_map_cam) >= 2 else found
+
+
+def _adjust(work: _Work, model: Any) -> SparseMap:
+    """Return a map that was adjusted as a whole."""
+    settings = work.settings
     options = mapper_options(work.camera, work.free_camera, settings)
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.refine_focal_length = options.ba_refine_focal_length
@@ -194,9 +201,7 @@ def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
     change = options.ba_global_max_refinement_change
     mapper.iterative_global_refinement(settings.whole_rounds, change, options.mapper, adjustment, options.triangulation)
     mapper.end_reconstruction(False)
-    whole = _map_of(work, model)
-    own = _without_beside(whole, work.problem)
-    return own if _enough(whole, settings) and len(own.T_map_cam) >= 2 else found
+    return _map_of(work, model)
 
 
 def _map_of(work: _Work, model: Any) -> SparseMap:
@@ -215,7 +220,7 @@ def _largest_first(found: SparseMap) -> tuple[int, int]:
     return -len(found.T_map_cam), min(found.T_map_cam)
 
 
-def _without_beside(found: SparseMap, problem: MapProblem) -> SparseMap:
+def without_beside(found: SparseMap, problem: MapProblem) -> SparseMap:
     """Return the map without the views beside."""
     poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
     seen = {k: view for k, view in found.seen.items() if k not in problem.beside}
@@ -306,6 +311,33 @@ def triangulate(
     return found if len(found.points) >= chosen.least_points else None
 
 
+def adjusted(
+    problem: MapProblem,
+    camera: Camera,
+    T_map_cam: Mapping[int, Poses],
+    settings: MappingSettings,
+    verified: Matches | None = None,
+) -> SparseMap | None:
+    """A map of views whose poses are about right: its points are made anew, and all is adjusted; None where they are
+    too few. `verified` is as for `correspondences`.
+    """
+    views = {key: view for key, view in problem.views.items() if key in T_map_cam}
+    pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in views and pair[1] in views}
+    part = replace(problem, views=views, pairs=pairs)
+    cache = correspondences(part, camera, "", settings, verified)
+    if cache is None:
+        return None
+    mapper, made = mapper_with_poses(cache, T_map_cam)
+    options = mapper_options(camera, "", settings)
+    for image_id in sorted(made.images):
+        mapper.triangulate_image(options.triangulation, image_id)
+    mapper.complete_and_merge_tracks(options.triangulation)
+    mapper.filter_points(options.mapper)
+    mapper.end_reconstruction(False)
+    found = _adjust(_Work(cache, part, camera, "", settings), made)
+    return found if _enough(found, settings) else None
+
+
 def correspondences(
     problem: MapProblem,
     camera: Camera,
@@ -317,6 +349,18 @@ def correspondences(
 
     `verified` are the rows of pairs that agree on a geometry, where that is known already.
     """
+    database = database_of(problem, camera, free_camera, settings, verified)
+    if database is None:
+        return None
+    options = pycolmap.DatabaseCacheOptions()
+    options.min_num_matches = settings.least_matches
+    return pycolmap.DatabaseCache.create(database, options)
+
+
+def database_of(
+    problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings, verified: Matches | None
+) -> Any:
+    """pycolmap's database, in memory; None when no two views have anything in common. `verified` is as above."""
     database = pycolmap.Database.open(":memory:")
     lens = make_lens(camera, free_camera)
     lens.camera_id = 1
@@ -347,11 +391,7 @@ def correspondences(
             database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
             database.write_two_view_geometry(a + 1, b + 1, found)
             count += 1
-    if not count:
-        return None
-    options = pycolmap.DatabaseCacheOptions()
-    options.min_num_matches = settings.least_matches
-    return pycolmap.DatabaseCache.create(database, options)
+    return database if count else None
 
 
 def _two_view(

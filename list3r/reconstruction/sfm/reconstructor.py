@@ -27,6 +27,7 @@ from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.sfm.adjustment import agreeing_rows
 from list3r.reconstruction.sfm.colmap import pixel_unit
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import make_finder
 from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, step_beside, with_neighbours
 from list3r.reconstruction.sfm.mapping import MapProblem, Matches, SparseMap, build_maps, triangulate
@@ -147,7 +148,9 @@ class SfmReconstructor:
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         if not self.camera_known:
             return build_maps(wider, camera, free_camera="focal", settings=s.calibration.mapping)
-        return build_maps(wider, camera, settings=s.mapping, verified=verified_rows(wider, camera, s.mapping))
+        verified = verified_rows(wider, camera, s.mapping)
+        maps = build_maps(wider, camera, settings=s.mapping, verified=verified)
+        return with_global_map(maps, wider, camera, s.mapping, verified)
 
     def _given(
         self, frames: Sequence[Frame], tracks: CornerTracks, problem: MapProblem, camera: Camera

@@ -177,6 +177,9 @@ class MappingSettings:
     when it is whole. 0 for maps that are adjusted so all the time."""
     settled: float = 0.0
     """Adjustments end when a step gains less than this share of the error."""
+    turned_scale: float = 0.0
+    """A map of all keyframes at once is tried where turns lose that much of the scale, or a map fell into pieces; 0 for
+    never. Of twelve chunks two whose map was broken have 0.08 and 0.16, others at most 0.043 (decision 0208)."""
     alike: float = 0.95
     """Maps with at least this share of the keyframes of the largest are compared by their error."""
     point_angle_deg: float = 1.0
@@ -281,7 +284,7 @@ def maps_of_chunks() -> MappingSettings:
     """Return how the keyframes of a chunk are mapped: maps settle, and grow roughly, which is as near to the truth and
     to the pictures (docs/decisions/0157 and 0181)."""
     return MappingSettings(
-        settled=1e-4, growth=2.0, part_iterations=5, part_rounds=1, part_views=4, rough_iterations=10
+        settled=1e-4, growth=2.0, part_iterations=5, part_rounds=1, part_views=4, rough_iterations=10, turned_scale=0.05
     )
 
 

@@ -1,0 +1,115 @@
+"""A map of all keyframes at once, for chunks in which a growing map can lose its scale.
+
+A map that grows keyframe by keyframe passes its scale on from one to the next. Where the camera turns on the spot it
+can slip into a local minimum: two halves that each are right, one of them larger by a tenth up to twice, which more
+adjustment does not mend (decision 0208). Global structure from motion (Pan et al., "Global Structure-from-Motion
+Revisited", ECCV 2024, as pycolmap has it) averages rotations and places all cameras and points together. It takes
+several times as long, so it is asked only where turns lose scale or a map fell into pieces; what explains more of the
+pictures is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from list3r.frames.base import Camera
+from list3r.reconstruction.sfm.colmap import pycolmap
+from list3r.reconstruction.sfm.mapping import (
+    MapProblem,
+    Matches,
+    Poses,
+    SparseMap,
+    adjusted,
+    database_of,
+    sparse_map,
+    without_beside,
+)
+from list3r.reconstruction.sfm.settings import MappingSettings
+from list3r.reconstruction.sfm.turning import only_turns
+from list3r.reconstruction.turns import lost_scale
+
+
+def with_global_map(
+    maps: Sequence[SparseMap], problem: MapProblem, camera: Camera, settings: MappingSettings, verified: Matches | None
+) -> list[SparseMap]:
+    """Return maps that grew from the keyframes of a problem, the largest first; in place of those that share keyframes
+    with it a global map that explains more of what was seen. `verified` is as for `correspondences`.
+    """
+    own = problem.views.keys() - problem.beside
+    if not maps or settings.turned_scale <= 0.0:
+        return list(maps)
+    if len(maps) == 1 and maps[0].T_map_cam.keys() == own and scale_lost_at_turns(maps[0]) < settings.turned_scale:
+        return list(maps)
+    found = global_map(problem, camera, settings, verified)
+    if found is None:
+        return list(maps)
+    met = [m for m in maps if m.T_map_cam.keys() & found.T_map_cam.keys()]
+
+    def explained(candidate: SparseMap) -> int:
+        """Observations that fit the map once its points are made anew, by its own keyframes alone."""
+        anew = adjusted(problem, camera, candidate.T_map_cam, settings, verified)
+        return sum(len(view.ids) for view in (candidate if anew is None else anew).seen.values())
+
+    if explained(found) <= sum(explained(m) for m in met):
+        return list(maps)
+    return sorted([found, *(m for m in maps if m not in met)], key=lambda m: -len(m.T_map_cam))
+
+
+def scale_lost_at_turns(found: SparseMap, steps: int = 10) -> float:
+    """Return the deviation of the logarithm of scale over the worst so many steps from keyframe to keyframe."""
+    keys = sorted(found.T_map_cam)
+    T = np.stack([found.T_map_cam[key] for key in keys])
+    seen = [np.array([found.points[n] for n in found.seen[key].ids.tolist()]).reshape(-1, 3) for key in keys]
+    deep = [np.linalg.norm(p - t[:3, 3], axis=1) for p, t in zip(seen, T, strict=True)]
+    usual = float(np.median(np.concatenate(deep)))
+    reach = np.array([float(np.median(d)) if len(d) else usual for d in deep])
+    variance = lost_scale(T, reach)
+    over = np.convolve(variance, np.ones(min(steps, max(len(variance), 1)))) if len(variance) else np.zeros(1)
+    return float(np.sqrt(over.max()))
+
+
+def global_map(
+    problem: MapProblem, camera: Camera, settings: MappingSettings, verified: Matches | None
+) -> SparseMap | None:
+    """Return the largest map that all keyframes give at once; None where there is none, or the camera only turns."""
+    database = database_of(problem, camera, "", settings, None)
+    if database is None:
+        return None
+    manager = pycolmap.ReconstructionManager()
+    pycolmap.GlobalPipeline(_options(settings), database, manager).run()
+    made = [sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
+    largest = max(made, key=lambda m: len(m.T_map_cam), default=None)
+    if largest is None:
+        return None
+    found = adjusted(problem, camera, _held(largest, settings), settings, verified)
+    if found is None:
+        return None
+    poses = _held(found, settings)
+    found = without_beside(replace(found, T_map_cam=poses, seen={k: found.seen[k] for k in poses}), problem)
+    places = {key: view.xy for key, view in problem.views.items()}
+    if len(found.T_map_cam) < 2 or only_turns(places, problem.pairs, found.T_map_cam, camera, settings.turning):
+        return None
+    return found
+
+
+def _held(found: SparseMap, settings: MappingSettings) -> dict[int, Poses]:
+    """Poses of the keyframes that enough of what they see holds."""
+    return {key: T for key, T in found.T_map_cam.items() if len(found.seen[key].ids) >= settings.least_matches}
+
+
+def _options(settings: MappingSettings) -> Any:
+    """Return how pycolmap makes the map: as it does by itself, but for a known camera, and the same every time."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed, options.min_num_matches = 1, settings.seed, settings.least_matches
+    mapper = options.mapper
+    mapper.num_threads, mapper.random_seed = 1, settings.seed
+    mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = settings.seed
+    mapper.global_positioning.use_gpu, mapper.retriangulation.ignore_two_view_tracks = False, False
+    adjustment = mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_extra_params = False
+    adjustment.ceres.use_gpu, adjustment.ceres.solver_options.num_threads = False, 1
+    return options
