@@ -36,27 +36,29 @@ from list3r.reconstruction.turns import lost_scale
 def with_global_map(
     maps: Sequence[SparseMap], problem: MapProblem, camera: Camera, settings: MappingSettings, verified: Matches | None
 ) -> list[SparseMap]:
-    """Return maps that grew from the keyframes of a problem, the largest first; in place of those that share keyframes
-    with it a global map that explains more of what was seen. `verified` is as for `correspondences`.
+    """Return maps that grew from the keyframes of a problem, the largest first.
+
+    Where turns may have lost their scale, or they are in pieces, they are adjusted once more with points made anew, or
+    a global map that explains as much of what was seen takes their place. `verified` is as for `correspondences`.
     """
     own = problem.views.keys() - problem.beside
     if not maps or settings.turned_scale <= 0.0:
         return list(maps)
     if len(maps) == 1 and maps[0].T_map_cam.keys() == own and scale_lost_at_turns(maps[0]) < settings.turned_scale:
         return list(maps)
+    anew = [adjusted(problem, camera, m.T_map_cam, settings, verified) or m for m in maps]
     found = global_map(problem, camera, settings, verified)
-    if found is None:
-        return list(maps)
-    met = [m for m in maps if m.T_map_cam.keys() & found.T_map_cam.keys()]
+    if found is not None:
+        alone = adjusted(problem, camera, found.T_map_cam, settings, verified) or found
+        met = [m for m in anew if m.T_map_cam.keys() & found.T_map_cam.keys()]
+        if _explained(alone) >= sum(map(_explained, met)):
+            anew = [found, *(m for m in anew if m not in met)]
+    return sorted(anew, key=lambda m: -len(m.T_map_cam))
 
-    def explained(candidate: SparseMap) -> int:
-        """Observations that fit the map once its points are made anew, by its own keyframes alone."""
-        anew = adjusted(problem, camera, candidate.T_map_cam, settings, verified)
-        return sum(len(view.ids) for view in (candidate if anew is None else anew).seen.values())
 
-    if explained(found) <= sum(explained(m) for m in met):
-        return list(maps)
-    return sorted([found, *(m for m in maps if m not in met)], key=lambda m: -len(m.T_map_cam))
+def _explained(found: SparseMap) -> int:
+    """Return how many observations of its keyframes a map explains."""
+    return sum(len(view.ids) for view in found.seen.values())
 
 
 def scale_lost_at_turns(found: SparseMap, steps: int = 10) -> float:
