@@ -1,6 +1,7 @@
 """Simulated walks given as colour pictures alone: trajectory, depth, instances and relations against the truth.
 
     python benchmarks/colour.py --seeds 31,32,33 --keep FOLDER --json benchmarks/results/colour.json
+    PYTHONPATH=. python benchmarks/colour.py --rooms --seeds 6201,6202 --json benchmarks/results/colour-rooms.json
 
 Each walk (two furnished rooms, 640x480, filmed at 12 frames a second) becomes a folder of its colour pictures, and
 `list3r build FOLDER --reconstruction sfm --intrinsics ...` a memory. `blank` is the share of 7 px windows, at 320 px
@@ -9,7 +10,8 @@ tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` s
 nothing. `things_scale` is the scale of the world by the middles of the things that are matched at IoU 0.5, over that
 by the cameras: 1 where things lie where the cameras saw them. Relations are those among things matched by masks.
 Walks and reconstructions that are in `--keep` are used again, and then the time is that of what is left.
-With `--step METRES` the walks are those of `wide_walks.py`, which says what is measured of them.
+With `--rooms` the walks are 300 frames of left-out rooms of `training/worlds`, in which the camera turns where it
+stands; their relations are not known. With `--step METRES` the walks are those of `wide_walks.py`, which says what is measured of them.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from wide_walks import compare_walks
 from list3r.api import open as open_memory
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import evaluate_scene, read_scene, relations_of_matches, scene_boxes
-from list3r.evaluation.trajectory import Trajectory, align, position_errors, read_tum
+from list3r.evaluation.trajectory import Trajectory, align, position_errors, read_tum, write_tum
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.masks import decode_mask
 from list3r.memory.store.store import Store
@@ -44,6 +46,8 @@ EVERY = 10
 """Frames between those whose masks are compared."""
 STEP = 4
 """Every so many pixels of a mask are compared."""
+ROOM_FRAMES = 300
+"""Frames of a walk through a left-out room."""
 LEAST_PX = 150
 """True things that never cover so many pixels count neither way."""
 
@@ -73,6 +77,7 @@ class Overlaps:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="31,32,33")
+    parser.add_argument("--rooms", action="store_true", help="left-out rooms of training/worlds")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--discovery", default="", help="such as learned,sam2; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
@@ -90,7 +95,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         root = args.keep or Path(scratch)
         for seed, method in ((int(w), m) for w in args.seeds.split(",") for m in args.discovery.split(",")):
-            figures = measured(root / f"seed-{seed}", seed, args.workers, method, args.frames)
+            folder = root / f"{'room' if args.rooms else 'seed'}-{seed}"
+            figures = measured(folder, seed, args.workers, method, args.frames, rooms=args.rooms)
             rows.append({"seed": seed, "discovery": method or "default", **figures})
             print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
             write_json(args.json, {"mean": means_of(rows), "seeds": rows})
@@ -112,15 +118,22 @@ def means(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     return {k: round(statistics.fmean(values), 4) if values else None for k, values in known.items()}
 
 
-def measured(folder: Path, seed: int, workers: int, discovery: str = "", frames: int | None = None) -> dict[str, Any]:
+def measured(
+    folder: Path, seed: int, workers: int, discovery: str = "", frames: int | None = None, *, rooms: bool = False
+) -> dict[str, Any]:
     """The figures of one walk, which is filmed, built and compared in `folder`; of its first `frames` alone."""
     settings = WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=frames)
     walk = folder / "walk"
     if not (walk / "truth.json").exists():
-        write_walk(walk, settings, workers)
+        if rooms:
+            film_room(walk, seed, frames or ROOM_FRAMES)
+        else:
+            write_walk(walk, settings, workers)
     colour = colour_only(folder / "colour", walk)
     camera = settings.camera()
     intrinsics = ",".join(f"{v:g}" for v in (camera.fx, camera.fy, camera.cx, camera.cy))
+    if rooms:
+        intrinsics = ",".join((walk / "calibration.txt").read_text().split())
     memory, depths = folder / f"memory{discovery}.l3r", folder / "reconstructions"
     words = ["build", str(colour), "-m", str(memory), "--force", "--reconstruction", "sfm", "--intrinsics", intrinsics]
     words += ["--discovery", discovery] if discovery else []
@@ -131,6 +144,18 @@ def measured(folder: Path, seed: int, workers: int, discovery: str = "", frames:
     row = {"frames": report["frames"], "posed": report["posed"], **usage, "cpu_s": round(spent, 1)}
     row["blank"] = blank_share(colour)
     return row | depth_errors(depths, walk) | scene_errors(memory, walk)
+
+
+def film_room(walk: Path, seed: int, frames: int) -> None:
+    """Film a left-out room; every second one has surfaces that are worn and printed, and exposure that changes."""
+    from discovery_memory import write_film
+
+    from training.worlds.film import FilmSettings, make_film
+
+    of = FilmSettings(seed, held_out=True, frames=frames, every=1, size=SIZE, sensor="structured", looks=seed % 2 == 0)
+    film = make_film(of)
+    write_film(walk, film, seed)
+    write_tum(walk / "groundtruth.txt", Trajectory(film.time_s, film.T_world_cam))
 
 
 def colour_only(folder: Path, walk: Path) -> Path:
