@@ -11,7 +11,8 @@ nothing. `things_scale` is the scale of the world by the middles of the things t
 by the cameras: 1 where things lie where the cameras saw them. Relations are those among things matched by masks.
 Walks and reconstructions that are in `--keep` are used again, and then the time is that of what is left.
 With `--rooms` the walks are 300 frames of left-out rooms of `training/worlds`, in which the camera turns where it
-stands; their relations are not known. With `--step METRES` the walks are those of `wide_walks.py`, which says what is measured of them.
+stands; their relations are not known. With `--step METRES` they are those of `wide_walks.py`, which says what is
+measured of them.
 """
 
 from __future__ import annotations
