@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
 from benchmarks.simulation.presets import make_video
@@ -12,7 +13,7 @@ from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult
 from list3r.memory.store.store import Store
-from list3r.pipeline import mapping
+from list3r.pipeline import mapping, placing
 from list3r.pipeline.settings import AssociationSettings
 
 
@@ -39,3 +40,25 @@ def test_a_chunk_fitted_in_ends_where_solving_the_whole_graph_puts_it(tmp_path: 
     grown = placed(tmp_path / "grown.l3r", chunks, model, AssociationSettings(solved_whole=0))
     for a, b in zip(whole, grown, strict=True):
         assert np.abs((a.inverse() @ b).log()).max() < 1e-6
+
+
+def test_a_camera_that_turns_makes_chunks_of_structure_from_motion_less_sure_and_edges_stay_as_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = FeedForwardModel(make_video("calm", 102), seed=102)
+    chunks = [model.chunk(span) for span in plan_chunks(170, ChunkSettings())]
+    sure, stated = [], []
+    for follows in (False, True):
+        monkeypatch.setattr(placing, "knows_cameras", lambda store, session_id, follows=follows: follows)
+        with Store.create(tmp_path / f"{follows}.l3r") as store:
+            with store.transaction():
+                store.facts.scale_kind = "relative"
+                session = store.sessions.add("simulation", "", {}, 170)
+            for chunk in chunks:
+                mapping.add_chunk(store, session, chunk, model, library=False)
+            covariance = store.chunks.all()[-1].covariance
+            assert covariance is not None
+            sure.append(covariance[6, 6])
+            stated.append([e.covariance for e in store.edges.all() if e.kind == "adjacent"])
+    assert sure[1] > sure[0]
+    assert all(np.array_equal(a, b) for a, b in zip(*stated, strict=True))
