@@ -97,7 +97,13 @@ class VideoMapSettings:
     """Fewest corners or features that make a pair."""
     mapping: MappingSettings = field(
         default_factory=lambda: MappingSettings(
-            steady=4.0, growth=1.7, whole_iterations=10, whole_rounds=1, part_iterations=6, settled=1e-4
+            steady=4.0,
+            growth=1.7,
+            whole_iterations=10,
+            whole_rounds=1,
+            part_iterations=6,
+            settled=1e-4,
+            turned_scale=0.04,
         )
     )
     """Rougher than a chunk's, since all is adjusted afterwards; grown again only where depth jumps: by 17 in a walk of

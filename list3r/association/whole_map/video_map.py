@@ -20,6 +20,7 @@ from list3r.association.whole_map.views import view_of
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.adjustment import adjust
 from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps, shared_rows
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
@@ -53,6 +54,7 @@ def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings:
     problem = video_problem(tracks, features, settings)
     verified = verified_rows(problem, camera, settings.mapping)
     maps = build_maps(problem, camera, settings=settings.mapping, verified=verified)
+    maps = with_global_map(maps, problem, camera, settings.mapping, verified)
     if not maps:
         return None
     joined = join_maps(maps, problem, features, camera, (settings.joining, settings.revisits))
