@@ -144,7 +144,8 @@ def measured(
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     row = {"frames": report["frames"], "posed": report["posed"], **usage, "cpu_s": round(spent, 1)}
     row["blank"] = blank_share(colour)
-    return row | depth_errors(depths, walk) | scene_errors(memory, walk)
+    row |= depth_errors(depths, walk) | scene_errors(memory, walk)
+    return {k: v for k, v in row.items() if not (rooms and k.startswith(("on_", "in_", "next_to_")))}
 
 
 def film_room(walk: Path, seed: int, frames: int) -> None:

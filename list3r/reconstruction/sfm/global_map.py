@@ -50,9 +50,9 @@ def with_global_map(
     found = global_map(problem, camera, settings, verified)
     if found is not None:
         alone = adjusted(problem, camera, found.T_map_cam, settings, verified) or found
-        met = [m for m in anew if m.T_map_cam.keys() & found.T_map_cam.keys()]
-        if _explained(alone) >= sum(map(_explained, met)):
-            anew = [found, *(m for m in anew if m not in met)]
+        apart = [m for m in anew if m.T_map_cam.keys().isdisjoint(found.T_map_cam)]
+        if _explained(alone) >= sum(map(_explained, anew)) - sum(map(_explained, apart)):
+            anew = [found, *apart]
     return sorted(anew, key=lambda m: -len(m.T_map_cam))
 
 
