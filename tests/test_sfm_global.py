@@ -112,6 +112,18 @@ def test_steps_aside_lose_no_scale_and_their_map_stays() -> None:
     assert with_global_map([found], part, CAMERA, settings, None)[0] is found
 
 
+def test_pieces_that_share_nothing_stay_apart() -> None:
+    true, settings = cameras(), maps_of_chunks()
+    ends = range(6), range(16, COUNT)
+    made = problem({k: T for k, T in true.items() if any(k in keys for keys in ends)})
+    pieces = []
+    for keys in ends:
+        found = triangulate(made, CAMERA, {k: true[k] for k in keys}, settings)
+        assert found is not None
+        pieces.append(found)
+    assert with_global_map(pieces, made, CAMERA, settings, None) == pieces
+
+
 @pytest.mark.parametrize("linked", [True, False])
 def test_nothing_is_made_of_a_camera_that_only_turns_or_of_keyframes_that_share_nothing(linked: bool) -> None:
     made = problem(cameras(aside=0.0))

@@ -4,8 +4,8 @@ A map that grows keyframe by keyframe passes its scale on from one to the next. 
 can slip into a local minimum: two halves that each are right, one of them larger by a tenth up to twice, which more
 adjustment does not mend (decision 0208). Global structure from motion (Pan et al., "Global Structure-from-Motion
 Revisited", ECCV 2024, as pycolmap has it) averages rotations and places all cameras and points together. It takes
-several times as long, so it is asked only where turns lose scale or a map fell into pieces; what explains more of the
-pictures is kept.
+several times as long, so it is asked only where turns lose scale or a map leaves apart what shares matches; what
+explains more of the pictures is kept.
 """
 
 from __future__ import annotations
@@ -38,13 +38,14 @@ def with_global_map(
 ) -> list[SparseMap]:
     """Return maps that grew from the keyframes of a problem, the largest first.
 
-    Where turns may have lost their scale, or they are in pieces, they are adjusted once more with points made anew, or
-    a global map that explains as much of what was seen takes their place. `verified` is as for `correspondences`.
+    Where turns may have lost their scale, or they leave apart what shares matches, they are adjusted once more with
+    points made anew, or a global map that explains as much of what was seen takes their place. `verified` is as for
+    `correspondences`.
     """
-    own = problem.views.keys() - problem.beside
     if not maps or settings.turned_scale <= 0.0:
         return list(maps)
-    if len(maps) == 1 and maps[0].T_map_cam.keys() == own and scale_lost_at_turns(maps[0]) < settings.turned_scale:
+    turned = any(scale_lost_at_turns(m) >= settings.turned_scale for m in maps)
+    if not turned and not _left_apart(maps, problem, settings, problem.pairs if verified is None else verified):
         return list(maps)
     anew = [adjusted(problem, camera, m.T_map_cam, settings, verified) or m for m in maps]
     found = global_map(problem, camera, settings, verified)
@@ -54,6 +55,15 @@ def with_global_map(
         if _explained(alone) >= sum(map(_explained, anew)) - sum(map(_explained, apart)):
             anew = [found, *apart]
     return sorted(anew, key=lambda m: -len(m.T_map_cam))
+
+
+def _left_apart(maps: Sequence[SparseMap], problem: MapProblem, settings: MappingSettings, pairs: Matches) -> bool:
+    """Return whether a keyframe shares enough matches with one that is in another map, or in none."""
+    of = {key: n for n, m in enumerate(maps) for key in m.T_map_cam}
+    return any(
+        len(rows) >= settings.least_matches and of.get(a) != of.get(b) and not {a, b} & problem.beside
+        for (a, b), rows in pairs.items()
+    )
 
 
 def _explained(found: SparseMap) -> int:

@@ -178,8 +178,8 @@ class MappingSettings:
     settled: float = 0.0
     """Adjustments end when a step gains less than this share of the error."""
     turned_scale: float = 0.0
-    """A map of all keyframes at once is tried where turns lose that much of the scale, or a map fell into pieces; 0 for
-    never. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046 (decision 0208)."""
+    """A map of all keyframes at once is tried where turns lose that much of the scale, or maps leave apart what shares
+    matches; 0 for never. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046 (decision 0208)."""
     alike: float = 0.95
     """Maps with at least this share of the keyframes of the largest are compared by their error."""
     point_angle_deg: float = 1.0
