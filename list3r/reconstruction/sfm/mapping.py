@@ -296,18 +296,10 @@ def triangulate(
 ) -> SparseMap | None:
     """Points of views whose poses are known; None when there are too few. `verified` is as for `correspondences`."""
     chosen = settings or MappingSettings()
-    known = {key: view for key, view in problem.views.items() if key in T_map_cam}
-    pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
-    cache = correspondences(MapProblem(known, pairs, problem.matched), camera, "", chosen, verified)
-    if cache is None:
+    made = _triangulated(problem, camera, T_map_cam, chosen, verified)
+    if made is None:
         return None
-    mapper, made = mapper_with_poses(cache, T_map_cam)
-    options = mapper_options(camera, "", chosen)
-    for image_id in sorted(made.images):
-        mapper.triangulate_image(options.triangulation, image_id)
-    mapper.complete_and_merge_tracks(options.triangulation)
-    mapper.filter_points(options.mapper)
-    found = sparse_map(made, problem, camera)
+    found = sparse_map(made[1], problem, camera)
     return found if len(found.points) >= chosen.least_points else None
 
 
@@ -321,10 +313,25 @@ def adjusted(
     """A map of views whose poses are about right: its points are made anew, and all is adjusted; None where they are
     too few. `verified` is as for `correspondences`.
     """
-    views = {key: view for key, view in problem.views.items() if key in T_map_cam}
-    pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in views and pair[1] in views}
-    part = replace(problem, views=views, pairs=pairs)
-    cache = correspondences(part, camera, "", settings, verified)
+    made = _triangulated(problem, camera, T_map_cam, settings, verified)
+    if made is None:
+        return None
+    cache, model = made
+    found = _adjust(_Work(cache, problem, camera, "", settings), model)
+    return found if _enough(found, settings) else None
+
+
+def _triangulated(
+    problem: MapProblem,
+    camera: Camera,
+    T_map_cam: Mapping[int, Poses],
+    settings: MappingSettings,
+    verified: Matches | None,
+) -> tuple[Any, Any] | None:
+    """pycolmap's correspondences and map of views whose poses are known, with points; None when none share anything."""
+    known = {key: view for key, view in problem.views.items() if key in T_map_cam}
+    pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
+    cache = correspondences(replace(problem, views=known, pairs=pairs), camera, "", settings, verified)
     if cache is None:
         return None
     mapper, made = mapper_with_poses(cache, T_map_cam)
@@ -334,8 +341,7 @@ def adjusted(
     mapper.complete_and_merge_tracks(options.triangulation)
     mapper.filter_points(options.mapper)
     mapper.end_reconstruction(False)
-    found = _adjust(_Work(cache, part, camera, "", settings), made)
-    return found if _enough(found, settings) else None
+    return cache, made
 
 
 def correspondences(
