@@ -1,15 +1,21 @@
 """How right the confidence of instances is in whole memories, and the weights that make it so.
 
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --world 9200-9202 --held 5101-5103 --home 61 --colour 46
-PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --world 9100-9116 --home 51-54,57 --colour 43,44 --fit
-PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --walks FOLDER1 FOLDER2 --fit
+PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --frames 450 --world 9100-9103 --home 51-54 --walks ... --fit
+PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --frames 250 --colour 43-48 --json FILE1
+PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --frames 250 --colour 43-48 --every 4 --json FILE2
+PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --colour 43-48 --room 5121-5129 --measured FILE1 FILE2 --fit
 
 Walks of 150 frames (`--colour`: 100; `--frames`) are built, and their libraries derived anew with nothing left out for
 want of confidence: `--world` rooms of the kind that discovery was trained on, `--held` left-out ones, both with given
-poses, `--home` the simulator's homes with a sensor's depth, `--colour` the same by colour alone, `--walks` folders that
-`discovery_memory.py` kept. An instance is right if it is matched with a true thing by masks at IoU 0.5; those of things
-hardly in view do not count. `--fit` prints `ConfidenceWeights` fitted to all walks, and how right they are in places
-left out of the fit, one in five in turn.
+poses, `--home` the simulator's homes with a sensor's depth, `--colour` the same by colour alone, `--room` left-out
+rooms by colour alone (300 frames, `colour.py --rooms`), each `--every` n-th frame of them. `--walks` are folders that
+`discovery_memory.py` kept, `--measured` files that this wrote before. Computed depth has odds of its own: `--fit` is
+for walks with a sensor or for walks without.
+
+An instance is right if it is matched with a true thing by masks at IoU 0.5; those of things hardly in view do not
+count. `--fit` prints `ConfidenceWeights` fitted to all walks, and how right they are in places left out of the fit, one
+in five in turn.
 """
 
 from __future__ import annotations
@@ -24,7 +30,7 @@ from typing import Any
 
 import numpy as np
 from calibration import calibration
-from colour import EVERY, LEAST_PX, SIZE, colour_only, compare_masks, memory_masks, true_masks
+from colour import EVERY, LEAST_PX, SIZE, colour_only, compare_masks, film_room, memory_masks, true_masks
 from discovery import MIN_PX, seeds_of
 from discovery_memory import film_of, write_film
 from machine import machine, write_json
@@ -34,13 +40,14 @@ from scipy.optimize import minimize
 import list3r
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import read_scene
+from list3r.frames.source import open_source, require_camera
 from list3r.memory.change.ledger import read_ledger
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.region import DirtySet, Region
 from list3r.memory.library.rules import WORLD, ConsolidationSettings
-from list3r.memory.library.uncertainty import ConfidenceWeights, Signs
+from list3r.memory.library.uncertainty import OF_COMPUTED_DEPTH, ConfidenceWeights, Signs
 from list3r.memory.library.weighing import Weighing
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.store.store import Store
@@ -48,8 +55,10 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.simulation.dataset import WalkSettings, write_walk
 from training.worlds.film import FilmSettings, make_film, varied
 
-KINDS = ("world", "held", "home", "colour")
-FRAMES = {"world": 150, "held": 150, "home": 150, "colour": 100}
+KINDS = ("world", "held", "home", "colour", "room")
+COMPUTED = {"colour", "room"}
+"""Walks without a sensor's depth."""
+FRAMES = {"world": 150, "held": 150, "home": 150, "colour": 100, "room": 300}
 THRESHOLDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 FOLDS = 5
 SHRINK = 0.003
@@ -61,23 +70,27 @@ def main() -> None:
     for kind in KINDS:
         parser.add_argument(f"--{kind}", default="", help="seeds, such as 1-3,7")
     parser.add_argument("--walks", type=Path, nargs="*", default=[], help="folders of walks and their learned.l3r")
+    parser.add_argument("--measured", type=Path, nargs="*", default=[], help="results that count, too")
     parser.add_argument("--frames", type=int, help="frames of a walk")
+    parser.add_argument("--every", type=int, default=1, help="build from every n-th frame of a walk")
     parser.add_argument("--keep", type=Path, required=True, help="folder of walks and memories; what is there is kept")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = [row for path in args.measured for row in json.loads(path.read_text())["walks"]]
     for kind in KINDS:
         for seed in seeds_of(getattr(args, kind)) if getattr(args, kind) else []:
             frames = args.frames or FRAMES[kind]
-            walk = args.keep / f"{kind}-{seed}-{frames}"
-            found = judged(built(walk, kind, seed, frames), walk, kind)
+            walk = thinned(filmed(args.keep / f"{kind}-{seed}-{frames}", kind, seed, frames), args.every)
+            found = judged(built(walk, kind), walk, kind, max(1, EVERY // args.every))
             rows.append({"kind": kind, "seed": seed, "place": f"{kind}-{seed}", **found})
             print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
     for walk in args.walks:
-        found = judged(walk / "learned.l3r", walk, "walk")
+        found = judged(walk / "learned.l3r", walk, "walk", EVERY)
         rows.append({"kind": "walk", "seed": walk.name, "place": "-".join(walk.name.split("-")[:2]), **found})
         print(walk.name, len(found["instances"]), "instances,", found["true"], "things", flush=True)
+    if args.fit and len({r["kind"] in COMPUTED for r in rows}) != 1:
+        parser.error("--fit wants walks that all have a sensor's depth, or all none")
     table = {k: summary([r for r in rows if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}
     print(machine())
     for kind, entry in table.items():
@@ -88,19 +101,59 @@ def main() -> None:
     write_json(args.json, {"mean": table, "walks": rows})
 
 
-def built(walk: Path, kind: str, seed: int, frames: int) -> Path:
+def filmed(walk: Path, kind: str, seed: int, frames: int) -> Path:
+    """The folder of a walk, filmed unless it is there."""
+    if (walk / "truth.json").exists():
+        return walk
+    if kind in ("world", "held"):
+        film = film_of(seed, None, frames, fitted=False) if kind == "held" else make_film(_room(seed, frames))
+        write_film(walk, film, seed)
+    elif kind == "room":
+        film_room(walk, seed, frames)
+    else:
+        write_walk(walk, WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=frames), 0)
+    return walk
+
+
+def thinned(walk: Path, every: int) -> Path:
+    """The folder of every n-th frame of a walk, at the times of as many first ones."""
+    few = walk.with_name(f"{walk.name}e{every}")
+    if every == 1 or (few / "truth.json").exists():
+        return walk if every == 1 else few
+    for name in ("rgb", "depth", "ids"):
+        (few / name).mkdir(parents=True, exist_ok=True)
+        paths = sorted((walk / name).iterdir())
+        for path, kept in zip(paths, paths[::every], strict=False):
+            shutil.copy(kept, few / name / path.name)
+    count = len(paths[::every])
+    for name in ("rgb.txt", "depth.txt"):
+        _write_rows(few / name, _rows(walk / name)[:count])
+    poses = _rows(walk / "groundtruth.txt")
+    when = [line.split()[0] for line in poses]
+    _write_rows(
+        few / "groundtruth.txt", [" ".join([t, *p.split()[1:]]) for t, p in zip(when, poses[::every], strict=False)]
+    )
+    shutil.copy(walk / "calibration.txt", few)
+    shutil.copy(walk / "truth.json", few)
+    return few
+
+
+def _rows(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def _write_rows(path: Path, rows: Sequence[str]) -> None:
+    path.write_text("".join(f"{row}\n" for row in rows))
+
+
+def built(walk: Path, kind: str) -> Path:
     """The memory of a walk, made unless it is there."""
     memory = walk / "memory.l3r"
     if (walk / "done").exists():
         return memory
-    if kind in ("world", "held"):
-        film = film_of(seed, None, frames, fitted=False) if kind == "held" else make_film(_room(seed, frames))
-        write_film(walk, film, seed)
-    elif not (walk / "truth.json").exists():
-        write_walk(walk, WalkSettings(seed=seed, size=SIZE, write_ids=True, frames=frames), 0)
     settings, options, source = BuildSettings(), list3r.SourceOptions(), walk
-    if kind == "colour":
-        camera = WalkSettings(seed=seed, size=SIZE).camera()
+    if kind in COMPUTED:
+        camera = require_camera(open_source(walk).info)
         source = colour_only(walk.parent / f"{walk.name}-pictures", walk)
         options = replace(options, intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy))
         settings = replace(settings, reconstruction="sfm")
@@ -117,10 +170,10 @@ def _room(seed: int, frames: int) -> FilmSettings:
     return replace(usual, frames=frames, every=1, sensor=("structured", "lidar")[seed // 2 % 2])
 
 
-def judged(memory: Path, walk: Path, kind: str) -> dict[str, Any]:
-    """Signs and confidence of each instance that is no structure, and whether it is right."""
+def judged(memory: Path, walk: Path, kind: str, every: int) -> dict[str, Any]:
+    """Signs and confidence of each instance that is no structure, and whether it is right by every n-th frame."""
     truth, memory = read_scene(walk / "truth.json"), _with_everything(memory)
-    frames = range(0, len(list((walk / "rgb").iterdir())), EVERY)
+    frames = range(0, len(list((walk / "rgb").iterdir())), every)
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     free = {e["id"] for e in truth["instances"] if not e["structure"]}
     least = LEAST_PX if kind in ("home", "colour") else MIN_PX
@@ -180,7 +233,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def fitted(rows: Sequence[dict[str, Any]]) -> ConfidenceWeights:
     """The weights under which what is right of these walks is likeliest."""
-    usual = ConfidenceWeights()
+    usual = OF_COMPUTED_DEPTH if rows[0]["kind"] in COMPUTED else ConfidenceWeights()
     signs = [Signs(**i["signs"]) for r in rows for i in r["instances"]]
     y = np.array([i["right"] for r in rows for i in r["instances"]], float)
     x = np.array([usual.inputs(s) for s in signs])

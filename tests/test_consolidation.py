@@ -285,7 +285,7 @@ def test_where_the_next_chunk_has_no_depth_it_misses_nothing(tmp_path: Path) -> 
         assert len(store.instances.all()) == 3
 
 
-def test_relations_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None:
+def test_relations_and_confidence_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None:
     given = ConsolidationSettings(relations=RelationSettings(contact_m=0.05))
     with create(tmp_path / "a.l3r") as store:
         assert settings_of(store, given) == given
@@ -294,6 +294,7 @@ def test_relations_of_computed_depth_allow_for_its_noise(tmp_path: Path) -> None
         found = settings_of(store, given)
         assert found.relations == RelationSettings(contact_m=0.05, noise_m=RelationSettings().computed_noise_m)
         assert found.structure.floor_band_m == found.structure.computed_floor_band_m > given.structure.floor_band_m
+        assert found.evidence.odds == given.evidence.computed_odds != given.evidence.odds
         assert settings_of(store, found) == found
 
 

@@ -1,4 +1,4 @@
-"""The position of a thing is as uncertain as the chunks that saw it."""
+"""How sure it is that a thing is one, and where: the position is as uncertain as the chunks that saw it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.library.uncertainty import position_covariance, position_sigma
+from list3r.memory.library.uncertainty import position_covariance, position_sigma, signs_of
+from list3r.memory.overlap.voxels import chunk_shapes
 from list3r.memory.records import ChunkRow
+from tests.memory_scenes import IMAGE, MUG, TABLE, node, surface
 
 
 def chunk(S: Sim3, covariance: np.ndarray | None, chunk_id: int = 0) -> ChunkRow:
@@ -46,3 +48,15 @@ def test_the_worst_chunk_counts_and_silence_stays_silence() -> None:
     assert position_sigma(np.zeros(3), []) is None
     assert position_sigma(np.zeros(3), [silent, sure]) == pytest.approx(0.01)
     assert position_sigma(np.ones(3), [chunk(Sim3.identity(), np.zeros((7, 7)))]) == 0.0
+
+
+def test_how_many_frames_a_second_were_filmed_says_nothing_of_a_thing() -> None:
+    def mug(every: int, there: slice = slice(0, 60)) -> float:
+        frames = np.arange(120)
+        seen = [frames[there][::every], frames[::every], frames[40:100][::every]]
+        nodes = [
+            node(0, k, surface(p, k), frames=f) for k, (p, f) in enumerate(zip((MUG, TABLE, MUG), seen, strict=True))
+        ]
+        return signs_of([(0, 0)], {0: chunk_shapes(nodes, IMAGE, chunk_id=0)}, len(seen[0]), 1.0).frames
+
+    assert mug(1) == mug(4) == 1.0 and mug(1, slice(0, 30)) == 0.5

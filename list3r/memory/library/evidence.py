@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.library.uncertainty import ConfidenceWeights, Signs, signs_of
+from list3r.memory.library.uncertainty import OF_COMPUTED_DEPTH, ConfidenceWeights, Signs, signs_of
 from list3r.memory.overlap.missed import MissedSettings, frames_beside, misses, pictures_confirm
 from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
 from list3r.memory.overlap.voxels import ChunkShapes, Ints
@@ -33,7 +33,9 @@ class EvidenceSettings:
     least_confidence: float = 0.3
     """What is less probably one thing and all of it is not shown; chosen on walks that the weights were not fitted to,
     where hardly any right one lies below it."""
-    weights: ConfidenceWeights = field(default_factory=ConfidenceWeights)
+    odds: ConfidenceWeights = field(default_factory=ConfidenceWeights)
+    computed_odds: ConfidenceWeights = field(default_factory=lambda: OF_COMPUTED_DEPTH)
+    """The same where depth was computed from colour."""
     claim_m: float = 0.1
     """Edge of the cells in which the claims of instances to a place are counted."""
     claims: int = 4
@@ -131,7 +133,7 @@ def weigh(
         if weighed[n]:
             signs = signs_of(group, chunks, found.frames, found.found / found.seen)
             sure = found.agreement if signs.structure > 0.5 else 1.0
-            found = replace(found, confidence=sure * settings.weights.probability(signs), signs=signs)
+            found = replace(found, confidence=sure * settings.odds.probability(signs), signs=signs)
         out.append(found)
     return out
 

@@ -78,6 +78,7 @@ def settings_of(store: Store, settings: ConsolidationSettings | None) -> Consoli
     noise, band = s.relations.computed_noise_m, s.structure.computed_floor_band_m
     return replace(
         s,
+        evidence=replace(s.evidence, odds=s.evidence.computed_odds),
         relations=replace(s.relations, noise_m=max(s.relations.noise_m, noise)),
         structure=replace(s.structure, floor_band_m=max(s.structure.floor_band_m, band), least_flagged=0.0),
     )

@@ -21,8 +21,8 @@ class Signs:
 
     stability: float
     """How probably its members are one thing each, times how well their masks fit; mean weighted by their frames."""
-    frames: int
-    """Different frames of the recording in which it is seen, at least 1."""
+    frames: float
+    """Different frames of the recording in which it is seen, by those in which instances of its chunks usually are."""
     area: float
     """Share of what is seen in a frame that its mask covers, in the middle of its frames."""
     size_m: float
@@ -36,12 +36,15 @@ class Signs:
 def signs_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes], frames: int, found: float) -> Signs:
     """Return the signs of a group that is seen in so many different frames, and found by this share of the chunks that
     saw its place.
+
+    Frames are counted by what is usual, as a slow camera and a fast one see the same thing in many frames or few.
     """
     own = [(chunks[k], int(np.searchsorted(chunks[k].local_id, n))) for k, n in group]
     weight = [max(1, c.seen_for(at)) for c, at in own]
     rows = [(c.stability[at], _area(c, at), c.size[at] / c.unit, c.structure[at]) for c, at in own]
     stability, area, size, structure = np.average(np.array(rows, np.float64), axis=0, weights=weight).tolist()
-    return Signs(stability, max(frames, 1), area, size, structure, found)
+    usual = float(np.mean([chunks[k].usually_seen_for for k in sorted({k for k, _ in group})]))
+    return Signs(stability, max(frames, 1) / usual, area, size, structure, found)
 
 
 def _area(chunk: ChunkShapes, at: int) -> float:
@@ -53,22 +56,22 @@ def _area(chunk: ChunkShapes, at: int) -> float:
 @dataclass(frozen=True)
 class ConfidenceWeights:
     """Log odds that a person would call an instance one thing and all of it: logistic regression on whole memories of
-    simulated walks (docs/decisions/0206-confidence-of-long-walks.md).
+    simulated walks with a sensor's depth (docs/decisions/0209-confidence-by-what-is-usual.md).
     """
 
-    stability: float = 9.17
-    frames: float = 0.55
+    stability: float = 9.31
+    frames: float = 0.74
     """Of the logarithm of the frames, up to `most_frames`."""
-    most_frames: int = 100
-    area: float = 0.63
+    most_frames: float = 2.0
+    area: float = 0.57
     """Of the logarithm of the share of the picture, from `least_area` on."""
     least_area: float = 1e-4
-    size: float = -1.12
+    size: float = -1.03
     """Of the logarithm of the diagonal in metres, from `least_size_m` on."""
     least_size_m: float = 0.01
-    found: float = 2.81
+    found: float = 3.42
     """Of the logarithm of the share of the chunks that saw its place and found it."""
-    constant: float = -6.49
+    constant: float = -4.74
 
     def probability(self, signs: Signs) -> float:
         """Return the probability; of structure, which is never seen whole, how sure its chunks are."""
@@ -83,6 +86,11 @@ class ConfidenceWeights:
         frames, area = min(signs.frames, self.most_frames), max(signs.area, self.least_area)
         size, found = math.log(max(signs.size_m, self.least_size_m)), math.log(signs.found)
         return signs.stability, math.log(frames), math.log(area), size, found
+
+
+OF_COMPUTED_DEPTH = ConfidenceWeights(stability=9.56, frames=2.46, area=0.53, size=-0.94, found=1.45, constant=-6.17)
+"""Weights where no sensor measured depth, fitted to videos without depth alone (decision 0209): what is there in few
+frames is more often a bit that was computed wrongly, and what another chunk missed tells less."""
 
 
 def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import compress, pairwise
 from typing import Any
 
@@ -120,6 +121,11 @@ class ChunkShapes:
     def seen_for(self, at: int) -> int:
         """Return in how many frames of the recording an instance (0 to N - 1) is seen, passed over ones included."""
         return self.stands_for * len(self.frames[at])
+
+    @cached_property
+    def usually_seen_for(self) -> float:
+        """In how many frames of the recording an instance of this chunk is seen: the median, at least 1."""
+        return self.stands_for * float(np.median([max(1, len(f)) for f in self.frames])) if self.frames else 1.0
 
     def only(self, kept: NDArray[np.bool_]) -> ChunkShapes:
         """Return some of the instances, (N,). Samples of the others still belong to something: they have the numbers
