@@ -46,7 +46,7 @@ from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.grouping import Grouping
 from list3r.memory.library.region import DirtySet, Region
-from list3r.memory.library.rules import WORLD, ConsolidationSettings
+from list3r.memory.library.rules import WORLD, ConsolidationSettings, settings_of
 from list3r.memory.library.uncertainty import OF_COMPUTED_DEPTH, ConfidenceWeights, Signs
 from list3r.memory.library.weighing import Weighing
 from list3r.memory.overlap.summaries import chunk_summaries
@@ -203,8 +203,8 @@ def _with_everything(memory: Path) -> Path:
 
 def _signs(memory: Path) -> dict[int, tuple[Signs, float]]:
     """What tells how sure each instance is that is no structure, and how sure it is."""
-    settings = ConsolidationSettings()
     with Store.open(memory) as store:
+        settings = settings_of(store, ConsolidationSettings())
         world, ledger = store.facts[WORLD], read_ledger(store, store.chunks.all())
         assert world is not None and ledger is not None
         region = Region(store, chunk_summaries(store, settings.shapes), world, settings)
