@@ -57,6 +57,10 @@ def test_how_many_frames_a_second_were_filmed_says_nothing_of_a_thing() -> None:
         nodes = [
             node(0, k, surface(p, k), frames=f) for k, (p, f) in enumerate(zip((MUG, TABLE, MUG), seen, strict=True))
         ]
-        return signs_of([(0, 0)], {0: chunk_shapes(nodes, IMAGE, chunk_id=0)}, len(seen[0]), 1.0).frames
+        shapes = chunk_shapes(nodes, IMAGE, chunk_id=0)
+        without = shapes.only(np.array([True, True, False]))  # whatever is left out later
+        found, later = (signs_of([(0, 0)], {0: c}, len(seen[0]), 1.0).frames for c in (shapes, without))
+        assert found == later
+        return found
 
     assert mug(1) == mug(4) == 1.0 and mug(1, slice(0, 30)) == 0.5

@@ -43,7 +43,7 @@ def signs_of(group: Sequence[Key], chunks: Mapping[int, ChunkShapes], frames: in
     weight = [max(1, c.seen_for(at)) for c, at in own]
     rows = [(c.stability[at], _area(c, at), c.size[at] / c.unit, c.structure[at]) for c, at in own]
     stability, area, size, structure = np.average(np.array(rows, np.float64), axis=0, weights=weight).tolist()
-    usual = float(np.mean([chunks[k].usually_seen_for for k in sorted({k for k, _ in group})]))
+    usual = float(np.mean([chunks[k].stands_for * chunks[k].usual_frames for k in sorted({k for k, _ in group})]))
     return Signs(stability, max(frames, 1) / usual, area, size, structure, found)
 
 

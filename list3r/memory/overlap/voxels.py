@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import compress, pairwise
 from typing import Any
 
@@ -117,15 +116,12 @@ class ChunkShapes:
     """Instance (0 to N - 1) of each of them, -1 for none. Shape (S,)."""
     stands_for: int = 1
     """Frames of the recording that one of `frames` stands for: itself, and those after it that were passed over."""
+    usual_frames: float = 1.0
+    """Number of `frames` of an instance, in the middle of all that the chunk found, whatever was left out since."""
 
     def seen_for(self, at: int) -> int:
         """Return in how many frames of the recording an instance (0 to N - 1) is seen, passed over ones included."""
         return self.stands_for * len(self.frames[at])
-
-    @cached_property
-    def usually_seen_for(self) -> float:
-        """In how many frames of the recording an instance of this chunk is seen: the median, at least 1."""
-        return self.stands_for * float(np.median([max(1, len(f)) for f in self.frames])) if self.frames else 1.0
 
     def only(self, kept: NDArray[np.bool_]) -> ChunkShapes:
         """Return some of the instances, (N,). Samples of the others still belong to something: they have the numbers
@@ -232,6 +228,7 @@ def chunk_shapes(
         boxes_xyxy=tuple(n.boxes_xyxy for n in nodes),
         areas_px=tuple(n.areas_px for n in nodes),
         visible_fraction=tuple(n.visible_fraction for n in nodes),
+        usual_frames=float(np.median([max(1, len(n.frames)) for n in nodes])) if nodes else 1.0,
     )
 
 
