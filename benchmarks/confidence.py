@@ -81,8 +81,9 @@ def main() -> None:
     for kind in KINDS:
         for seed in seeds_of(getattr(args, kind)) if getattr(args, kind) else []:
             frames = args.frames or FRAMES[kind]
-            walk = thinned(filmed(args.keep / f"{kind}-{seed}-{frames}", kind, seed, frames), args.every)
-            found = judged(built(walk, kind), walk, kind, max(1, EVERY // args.every))
+            walk = filmed(args.keep / f"{kind}-{seed}-{frames}", kind, seed, frames)
+            compared = max(1, EVERY // args.every) * args.every
+            found = judged(built(walk, kind, args.every), walk, kind, compared)
             rows.append({"kind": kind, "seed": seed, "place": f"{kind}-{seed}", **found})
             print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
     for walk in args.walks:
@@ -115,43 +116,13 @@ def filmed(walk: Path, kind: str, seed: int, frames: int) -> Path:
     return walk
 
 
-def thinned(walk: Path, every: int) -> Path:
-    """The folder of every n-th frame of a walk, at the times of as many first ones."""
-    few = walk.with_name(f"{walk.name}e{every}")
-    if every == 1 or (few / "truth.json").exists():
-        return walk if every == 1 else few
-    for name in ("rgb", "depth", "ids"):
-        (few / name).mkdir(parents=True, exist_ok=True)
-        paths = sorted((walk / name).iterdir())
-        for path, kept in zip(paths, paths[::every], strict=False):
-            shutil.copy(kept, few / name / path.name)
-    count = len(paths[::every])
-    for name in ("rgb.txt", "depth.txt"):
-        _write_rows(few / name, _rows(walk / name)[:count])
-    poses = _rows(walk / "groundtruth.txt")
-    when = [line.split()[0] for line in poses]
-    _write_rows(
-        few / "groundtruth.txt", [" ".join([t, *p.split()[1:]]) for t, p in zip(when, poses[::every], strict=False)]
-    )
-    shutil.copy(walk / "calibration.txt", few)
-    shutil.copy(walk / "truth.json", few)
-    return few
-
-
-def _rows(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
-
-
-def _write_rows(path: Path, rows: Sequence[str]) -> None:
-    path.write_text("".join(f"{row}\n" for row in rows))
-
-
-def built(walk: Path, kind: str) -> Path:
-    """The memory of a walk, made unless it is there."""
-    memory = walk / "memory.l3r"
-    if (walk / "done").exists():
+def built(walk: Path, kind: str, every: int) -> Path:
+    """The memory of every n-th frame of a walk, made unless it is there."""
+    name = f"-every-{every}" if every > 1 else ""
+    memory, done = walk / f"memory{name}.l3r", walk / f"done{name}"
+    if done.exists():
         return memory
-    settings, options, source = BuildSettings(), list3r.SourceOptions(), walk
+    settings, options, source = BuildSettings(), list3r.SourceOptions(every=every), walk
     if kind in COMPUTED:
         camera = require_camera(open_source(walk).info)
         source = colour_only(walk.parent / f"{walk.name}-pictures", walk)
@@ -160,7 +131,7 @@ def built(walk: Path, kind: str) -> Path:
     elif kind != "home":
         settings = replace(settings, poses="given")
     list3r.build(source, memory, options=options, settings=settings, workers=0, force=True).close()
-    (walk / "done").touch()
+    done.touch()
     return memory
 
 
