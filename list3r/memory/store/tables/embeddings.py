@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.checksums import PART_BITS, side_by_side, summed_tables
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.table import batches
 
@@ -36,7 +35,7 @@ class Embeddings:
     def all(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return ids (N,) and vectors (N, D) of a named space."""
         query = "SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance"
-        return self._checked(self._connection.rows(query, (space,)), space)
+        return _vectors(self._connection.rows(query, (space,)), space)
 
     def drop(self, instance_id: int) -> None:
         """Forget the vectors of an instance."""
@@ -44,32 +43,12 @@ class Embeddings:
         self._connection.execute("DELETE FROM embeddings WHERE instance = ?", (instance_id,))
 
     def of(self, space: str, ids: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one.
-
-        In a large file each is compared with its own checksum, without the rows that it stands among.
-        """
+        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one."""
         rows: list[tuple[Any, ...]] = []
         for part, marks in batches(ids):
-            query = f"SELECT instance, space, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
-            found = self._connection.rows(query, (*part, space))
-            rows += self._connection.believed("embeddings", found, keep=False)
-        return _vectors([(instance, vector) for instance, _, vector in sorted(rows)], space)
-
-    def seals(self) -> dict[int, bytes]:
-        """Return what changes when any vector of a part of the table does, by part; empty where it is being written."""
-        return self._connection.seals("embeddings")
-
-    def parts_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the parts of the table in which the vectors of instances stand. Shape (N,) each."""
-        return ids >> PART_BITS
-
-    def in_parts(self, space: str, parts: Iterable[int]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-        """Yield ids (n,) and vectors (n, D) of a named space that stand in some parts of the table, in order of ids."""
-        for name, some in side_by_side(("embeddings", part) for part in parts):
-            where, bounds = summed_tables()[name].where(some)
-            query = f"SELECT instance, vector FROM embeddings WHERE {where} AND space = ? ORDER BY instance"
-            if rows := self._connection.rows(query, (*bounds, space)):
-                yield self._checked(rows, space)
+            query = f"SELECT instance, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
+            rows += self._connection.rows(query, (*part, space))
+        return _vectors(sorted(rows), space)
 
     def batches(self, space: str, size: int = 20_000) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
         """Yield ids (n,) and vectors (n, D) of a named space, in order of ids, at most `size` at a time."""
@@ -77,7 +56,7 @@ class Embeddings:
         query = "SELECT instance, vector FROM embeddings WHERE instance > ? AND space = ? ORDER BY instance LIMIT ?"
         while rows := self._connection.rows(query, (last, space, size)):
             last = rows[-1][0]
-            yield self._checked(rows, space)
+            yield _vectors(rows, space)
 
     def count(self, space: str) -> int:
         """Return how many vectors a named space holds."""
@@ -100,10 +79,6 @@ class Embeddings:
             " WHERE held.space IS NOT NULL) SELECT space FROM held WHERE space IS NOT NULL"
         )
         return [r[0] for r in self._connection.rows(query)]
-
-    def _checked(self, rows: list[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        self._connection.sound("embeddings", (row[0] for row in rows))
-        return _vectors(rows, space)
 
 
 def _vectors(rows: Sequence[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
