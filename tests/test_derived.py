@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from list3r.memory.store.checksums import side_by_side
 
 from list3r.memory.overlap.summaries import SummaryCache, sample_of
-from list3r.memory.store.checksums import side_by_side
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
 

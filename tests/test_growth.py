@@ -399,9 +399,10 @@ def test_a_chunk_changes_no_row_of_what_is_far_away(walks: ModuleType, store: St
 def test_as_much_is_written_for_a_late_chunk_as_for_an_early_one(walks: ModuleType, store: Store) -> None:
     counts = []
     for index in range(16):
-        before, rows = len(store.embeddings.touched), store.connection._database.total_changes
+        before, rows = store.embeddings.changes(), store.connection._database.total_changes()
         add(store, visit(walks, index, index))
-        counts.append((len(store.embeddings.touched) - before, store.connection._database.total_changes - rows))
+        written = sum(len(store.embeddings.changed(space, before)[0]) for space in store.embeddings.spaces())
+        counts.append((written, store.connection._database.total_changes() - rows))
     assert {c for c, _ in counts[6:]} <= {counts[6][0], counts[7][0]}
     assert max(r for _, r in counts[12:]) <= 1.3 * max(r for _, r in counts[6:8])
 

@@ -63,6 +63,8 @@ class Connection:
         self._lock = lock
         self._process = os.getpid()
         self._version = 0
+        self.writing = False
+        """Whether a transaction runs that writes."""
         self._guard = threading.RLock()
         self._on_forget: list[weakref.WeakMethod[Callable[[], None]]] = []
         self.rollbacks = 0
@@ -189,6 +191,7 @@ class Connection:
             self._check_process()
             try:
                 self._version = self._database.begin("IMMEDIATE")
+                self.writing = True
                 try:
                     yield
                     self._database.commit()
@@ -200,6 +203,8 @@ class Connection:
                 if isinstance(error, UnicodeEncodeError):  # a name of a file may hold any bytes
                     raise OptionError(f"{str(error.object)[:200]} is not valid UTF-8; rename it") from error
                 raise MemoryFileError(explained(self.path, error)) from error
+            finally:
+                self.writing = False
 
     def _roll_back(self) -> None:
         self.rollbacks += 1
@@ -281,8 +286,11 @@ class Connection:
 
     def damage(self) -> list[str]:
         """Every damage found, in one pass over the file."""
-        with self._guard:
-            return list(damage_of(self._database))
+        try:
+            with self.snapshot():
+                return list(damage_of(self._database))
+        except MemoryFileError as error:
+            return [str(error.__cause__ or error)]
 
     def _check_process(self) -> None:
         """Raise `MemoryFileError` in a forked child: the locks of the file are those of its parent."""

@@ -104,6 +104,7 @@ class Database(apsw.Connection):
 
     def close(self, force: bool = False) -> None:
         """Let the file go. SQLite asks for it alone, to fold in a log, and does without; what that says is no error."""
+        self._watched.count = bytes
         with contextlib.suppress(apsw.IOError, apsw.BusyError):
             super().close(force)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import count
 from typing import cast
 
@@ -27,6 +27,7 @@ _FRAME_HEADER = 24
 _LOG_HEADER = 32
 _FILE_HEADER = 100
 _SIZE_AT = slice(16, 18)
+_COUNT_AT = slice(24, 28)
 _numbers = count()
 
 
@@ -88,6 +89,8 @@ class WatchedFile(apsw.VFS):
         self.unjudged: dict[int, int] | None = {}
         """What was read while the sums of the state that is read are not known yet; None once they are."""
         self.checking = True
+        self.count: Callable[[], bytes] = bytes
+        """How often the file was changed, as its first page says: big-endian."""
         self._noted: set[int] | None = None
         self.name = f"list3r-{next(_numbers)}"
         super().__init__(self.name, "unix")
@@ -126,6 +129,13 @@ class WatchedFile(apsw.VFS):
         finally:
             self._noted = None
 
+    def check_log(self, first_page: bytes) -> None:
+        """Compare the first page in a log with that in the file, which knows no changes that the log does not. Every
+        transaction ends with the first page. Raises `PageDamaged`.
+        """
+        if self.checking and self.count() > first_page[_COUNT_AT]:
+            raise PageDamaged("the log beside it is of another file or of an earlier state of this one")
+
     def note_written(self, page: int, data: bytes) -> None:
         """Take down the sum of a page."""
         self.written[page] = _sum(data)
@@ -157,6 +167,7 @@ class _Main(apsw.VFSFile):
         head = super().xRead(_FILE_HEADER, 0)
         if len(head) == _FILE_HEADER and (size := int.from_bytes(head[_SIZE_AT], "big")):
             watched.page_bytes = 2**16 if size == 1 else size
+        watched.count = lambda: super(_Main, self).xRead(4, _COUNT_AT.start)
 
     def xRead(self, amount: int, offset: int) -> bytes:
         """Read; of a large value SQLite asks for the first bytes of a page alone."""
@@ -178,7 +189,10 @@ class _Log(apsw.VFSFile):
         """Read, a frame or what its page holds."""
         data = super().xRead(amount, offset)
         if self._is_page(amount, offset):
-            self._watched.note_read(self._page(offset), data)
+            page = self._page(offset)
+            if page == 1:
+                self._watched.check_log(data)
+            self._watched.note_read(page, data)
         return data
 
     def xWrite(self, data: bytes, offset: int) -> None:

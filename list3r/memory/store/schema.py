@@ -104,10 +104,10 @@ MIGRATIONS: tuple[str, ...] = (
         FOREIGN KEY (chunk_id, local_id) REFERENCES local_instances) STRICT, WITHOUT ROWID;
     CREATE INDEX observations_by_instance ON observations (instance);
     CREATE TABLE embeddings (
-        instance INTEGER NOT NULL REFERENCES instances, space TEXT NOT NULL,
+        instance INTEGER NOT NULL REFERENCES instances, space TEXT NOT NULL, change INTEGER NOT NULL,
         vector BLOB NOT NULL CHECK (length(vector) > 0 AND length(vector) % 4 = 0),
         PRIMARY KEY (instance, space)) STRICT, WITHOUT ROWID;
-    CREATE INDEX embeddings_by_space ON embeddings (space);
+    CREATE INDEX embeddings_by_space ON embeddings (space, change);
     CREATE TABLE relations (
         subject INTEGER NOT NULL REFERENCES instances, predicate TEXT NOT NULL,
         object INTEGER NOT NULL REFERENCES instances, confidence REAL NOT NULL CHECK (confidence BETWEEN 0 AND 1),

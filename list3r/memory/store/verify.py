@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from list3r.memory.store.database import FAILURES, Database
 
 _MOST = 100
-"""Damages that are named."""
+"""Rows that point nowhere that are told."""
 
 
 def damage_of(database: Database) -> Iterator[str]:
     """Pages that are not as they were written, what SQLite and the rules of the schema find amiss, and references that
-    point nowhere.
+    point nowhere; inside a snapshot.
     """
-    try:
-        database.begin()
-    except FAILURES as error:
-        yield str(error)
-        return
-    try:
-        with database.noting() as pages:
-            said = [*_said(database, "PRAGMA integrity_check")]
-            where = dict(_said(database, "SELECT pageno, name FROM dbstat")) if pages else {}
-            lost = [*_said(database, "PRAGMA foreign_key_check")]
-        yield from (f"{where.get(page, 'a table')}: page {page} is not as it was written" for page in sorted(pages))
-        yield from (f"SQLite: {row[0]}" for row in said if row[0] != "ok")
-        yield from (f"{table}: a row points to one of {other} that is not there" for table, _, other, _ in lost[:_MOST])
-    finally:
-        database.roll_back()
+    with database.noting() as pages:
+        said = [*_said(database, "PRAGMA integrity_check")]
+        where = dict(_said(database, "SELECT pageno, name FROM dbstat")) if pages else {}
+        lost = [*_said(database, "PRAGMA foreign_key_check")]
+    for page in sorted(pages):
+        yield (f"{where[page]}: " if page in where else "") + f"page {page} is not as it was written"
+    yield from (f"SQLite: {row[0]}" for row in said if row[0] != "ok")
+    yield from (f"{table}: a row points to one of {other} that is not there" for table, _, other, _ in lost[:_MOST])
 
 
-def _said(database: Database, query: str) -> Iterator[tuple]:
+def _said(database: Database, query: str) -> Iterator[tuple[Any, ...]]:
     """Rows of a query, until it fails."""
     try:
         yield from database.execute(query)
