@@ -41,10 +41,10 @@ class Database(apsw.Connection):
         self._watched.unjudged = {}
         self.execute(f"BEGIN {how}")
         try:
-            version = int(self.execute("PRAGMA main.data_version").fetchall()[0][0])
+            version = int(self.execute("PRAGMA main.data_version").fetchall()[0][0])  # type: ignore[arg-type]
             rows = None
             if version != self._version:
-                rows = unsealed(self.execute(_SUMS).fetchall())
+                rows = unsealed(self.execute(_SUMS).fetchall())  # type: ignore[arg-type]
                 check_state(self, rows)
             self._watched.judge(rows)
             self._version = version

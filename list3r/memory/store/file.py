@@ -120,7 +120,8 @@ def identified(path: Path, database: Database) -> int:
 def numbers(database: Database) -> tuple[int, int]:
     """Return the application id and the schema version of a file."""
     application, version = (
-        int(database.execute(f"PRAGMA {name}").fetchone()[0]) for name in ("application_id", "user_version")
+        int(database.execute(f"PRAGMA {name}").fetchall()[0][0])  # type: ignore[arg-type]
+        for name in ("application_id", "user_version")
     )
     return application, version
 
@@ -294,7 +295,7 @@ def not_alone(path: Path, database: Database) -> str | None:
             f"what was written last lies in {log.name} ({size / 1e6:.2f} MB): a copy needs both files; "
             f"`list3r repair {path}` folds it in when nobody writes"
         )
-    copied = database.execute("PRAGMA journal_mode").fetchone()[0] == "off"
+    copied = database.execute("PRAGMA journal_mode").fetchall()[0][0] == "off"
     return f"it was copied while {log.name} was beside it; what was written last may be missing" if copied else None
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import Any
 
 import apsw
 
@@ -213,11 +214,13 @@ def read_schema(database: apsw.Connection) -> dict[tuple[str, str], str]:
 def tables(version: int = SCHEMA_VERSION) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
     """Return the tables of rows of ours by name: their columns, and those of their key."""
     with scratch_database(version) as database:
-        names = database.execute(
+        found: list[tuple[Any, ...]] = database.execute(
             "SELECT name FROM pragma_table_list WHERE schema = 'main' AND type = 'table' AND name NOT LIKE 'sqlite_%'"
             " AND name != 'pages' ORDER BY name"
         ).fetchall()
-        info = {name: database.execute(f"PRAGMA table_info({name})").fetchall() for (name,) in names}
+        info: dict[str, list[tuple[Any, ...]]] = {
+            str(name): database.execute(f"PRAGMA table_info({name})").fetchall() for (name,) in found
+        }
     return {
         name: (
             tuple(str(row[1]) for row in rows),
