@@ -55,6 +55,35 @@ def test_what_is_written_and_taken_back_is_sound_to_all(
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+def test_sums_that_were_not_committed_are_forgotten(make_memory: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, rng = make_memory(), random.Random(1)
+    run = database.Database.execute
+
+    def full(self: database.Database, statement: str, *more: object) -> apsw.Cursor:
+        if statement == "COMMIT":
+            raise apsw.FullError("database or disk is full")
+        return run(self, statement, *more)  # type: ignore[arg-type]
+
+    def grow(store: Store, count: int) -> None:
+        for n in range(count):
+            key = f"{rng.random()} {n}"
+            store.connection.execute("INSERT INTO memory VALUES (?, ?)", (key, rng.randbytes(400_000).hex()))
+
+    with Store.open(path, writable=True) as store:
+        for k in range(3):
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(database.Database, "execute", full)
+                with pytest.raises(MemoryFileError, match="full"), store.transaction():
+                    grow(store, 12)
+            with store.transaction():
+                store.ids.add_aliases({n: 2 for n in range(1000 * (k + 1), 1000 * (k + 1) + 900)})
+                grow(store, 8)
+            with Store.open(path) as reader:
+                assert reader.verify() == [] and len(reader.ids.aliases()) == 900 * (k + 1)
+    with Store.open(path) as again:
+        assert again.verify() == []
+
+
 def test_a_reader_amid_a_snapshot_is_told_of_no_damage_by_what_is_written(
     make_memory: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:

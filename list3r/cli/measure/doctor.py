@@ -18,6 +18,7 @@ from list3r.models.device import find_gpu
 from list3r.models.presets import missing_package
 
 _PACKAGES = (
+    ("apsw", "everything"),
     ("numpy", "everything"),
     ("scipy", "everything"),
     ("opencv-python-headless", "reading frames, features"),
@@ -42,7 +43,7 @@ _PACKAGES = (
     ("rerun-sdk", "export --to rerun"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
-_NEEDED = {"numpy", "scipy", "networkx", "faiss-cpu", "typer", "rich"}
+_NEEDED = {"apsw", "numpy", "scipy", "networkx", "faiss-cpu", "typer", "rich"}
 """What asking a memory takes; the others come with extras, which a command that lacks one names."""
 _LIBRARIES = (
     ("GL", "Open3D only (apt-get install libgl1 libegl1)"),

@@ -65,12 +65,10 @@ class Database(apsw.Connection):
     def commit(self) -> None:
         """End a transaction that wrote, with the sums of the pages that it changed."""
         sums, watched = self._sealing.seal(), self._watched
-        watched.round = set()
         self.execute("COMMIT")
         if sums is not None:
             watched.sums = sums
-            late = [p for p in watched.round - watched.own - {1} if watched.written[p] != sums.of(p)]
-            assert not late, f"pages {late} changed after they were summed"
+            assert watched.agrees(sums), "a page changed after it was summed"
         watched.checking = True
         watched.forget()
 

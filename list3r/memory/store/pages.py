@@ -4,9 +4,9 @@ The table `pages` holds a CRC-32 of every page of the file, and a transaction wr
 So a flipped byte, a page that was zeroed or swapped, and one of another state of the file are refused where a question
 reads them, be they of a table, an index, the R*Tree or the words; and none is written over unseen.
 
-A file system of our own between SQLite and the disk (`apsw.VFS`) sees each page as it is read or written. The pages of
-the table of sums itself have no sum there, each of its rows ends with one of its own. Page 1 is only seen as a
-transaction ends; what it holds, the schema and how many pages there are and are free, is summed as a row of its own.
+A file system of our own between SQLite and the disk (`apsw.VFS`) sees each page as it is read or written. Each row of
+the table of sums ends with a sum of its own. Page 1 is only seen as a transaction ends; what it holds, the schema and
+how many pages there are and are free, is summed as a row of its own.
 """
 
 from __future__ import annotations
@@ -80,12 +80,8 @@ class WatchedFile(apsw.VFS):
         """Zero of a file that is empty yet."""
         self.sums = Sums({})
         """As of the last transaction."""
-        self.own: set[int] = set()
-        """Pages of the table of sums."""
         self.written: dict[int, int] = {}
-        """Sums of the pages that the transaction that runs has written so far;"""
-        self.round: set[int] = set()
-        """which of them since this was last emptied."""
+        """Sums of the pages that the transaction that runs has written so far."""
         self.unjudged: dict[int, int] | None = {}
         """What was read while the sums of the state that is read are not known yet; None once they are."""
         self.checking = True
@@ -108,10 +104,8 @@ class WatchedFile(apsw.VFS):
         found = _sum(data)
         if self.unjudged is not None:
             self.unjudged[page] = found
-        elif page in self.written:
-            self._compare(page, found, self.written[page])
-        elif page not in self.own:
-            self._compare(page, found, self.sums.of(page))
+        else:
+            self._compare(page, found, self.written.get(page) or self.sums.of(page))
 
     def _compare(self, page: int, found: int, known: int) -> None:
         if found == known:
@@ -138,8 +132,12 @@ class WatchedFile(apsw.VFS):
 
     def note_written(self, page: int, data: bytes) -> None:
         """Take down the sum of a page."""
-        self.written[page] = _sum(data)
-        self.round.add(page)
+        if page > 1:
+            self.written[page] = _sum(data)
+
+    def agrees(self, sums: Sums) -> bool:
+        """Return whether these are the sums of what the transaction that runs has written."""
+        return all(sums.of(page) == found for page, found in self.written.items())
 
     def judge(self, rows: Mapping[int, bytes] | None) -> None:
         """Compare what was read before the sums were known; None where they are those of before. Raises
@@ -149,11 +147,7 @@ class WatchedFile(apsw.VFS):
             self.sums = Sums(rows)
         read, self.unjudged = self.unjudged or {}, None
         for page, found in read.items():
-            known = self.sums.of(page)
-            if known == 0 and rows is not None:
-                self.own.add(page)
-            elif page not in self.own:
-                self._compare(page, found, known)
+            self._compare(page, found, self.sums.of(page))
 
     def forget(self) -> None:
         """What was written was taken back."""
@@ -221,29 +215,23 @@ class Sealing:
         """Write them, inside the transaction; what they are once it is committed, None where it changed nothing.
 
         What SQLite writes is known when it is written, so that comes first. Then the table of sums is written, until
-        that changes no other page: a new row may take a page, and pages that rows lie on are first met here.
+        that changes no other sum: a new row may take a page. The sum of a page of this table does not change with what
+        its rows say, for a CRC over something and its own CRC is always the same.
         """
         watched = self._watched
-        watched.round = set()
         self._database.execute("SAVEPOINT whole; RELEASE whole")  # the words are written as late as that
         self._database.cache_flush()
-        fresh = {page: found for page, found in watched.written.items() if page not in watched.own and page != 1}
         if not watched.written and self._state() == watched.sums.rows.get(_STATE):
             return None
         sums = Sums(watched.sums.rows)
-        for turn in count():
-            rows = sums.changed(fresh)
-            sums.rows |= {**rows, _STATE: self._state()}
-            self._write({**rows, _STATE: sums.rows[_STATE]})
-            watched.round = set()
+        while True:
+            rows = sums.changed({page: found for page, found in watched.written.items() if found != sums.of(page)})
+            rows[_STATE] = self._state()
+            sums.rows |= rows
+            self._write(rows)
             self._database.cache_flush()
-            others = watched.round - watched.own - {1}
-            if not others and sums.rows[_STATE] == self._state():
+            if rows[_STATE] == self._state() and watched.agrees(sums):
                 return sums
-            if turn > 1:  # nothing is allocated any more: these are the pages that the rows lie on
-                watched.own |= others
-            fresh = {page: 0 if turn > 1 else watched.written[page] for page in others}
-        raise AssertionError
 
     def _write(self, rows: Mapping[int, bytes]) -> None:
         for first, held in rows.items():
