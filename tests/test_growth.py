@@ -122,7 +122,7 @@ def tables(store: Store) -> dict[str, list[tuple[object, ...]]]:
         "members": store.connection.rows("SELECT * FROM members ORDER BY chunk_id, local_id"),
         "observations": store.connection.rows("SELECT * FROM observations ORDER BY chunk_id, local_id"),
         "relations": store.connection.rows("SELECT * FROM relations ORDER BY subject, predicate, object"),
-        "embeddings": store.connection.rows("SELECT * FROM embeddings ORDER BY instance"),
+        "embeddings": store.connection.rows("SELECT instance, space, vector FROM embeddings ORDER BY instance"),
         "dropped": store.connection.rows("SELECT chunk_id, dropped FROM settled ORDER BY chunk_id"),
         "overlaps": store.connection.rows("SELECT * FROM overlaps ORDER BY u, v"),
         "aliases": store.connection.rows("SELECT * FROM aliases ORDER BY id"),
@@ -376,7 +376,11 @@ def rows_of(store: Store, keep: Callable[[int], bool]) -> dict[str, list[tuple[o
         "relations": [
             r for r in store.connection.rows("SELECT * FROM relations ORDER BY 1, 2, 3") if keep(r[0]) and keep(r[2])
         ],
-        "embeddings": [r for r in store.connection.rows("SELECT * FROM embeddings ORDER BY instance") if keep(r[0])],
+        "embeddings": [
+            r
+            for r in store.connection.rows("SELECT instance, space, vector FROM embeddings ORDER BY instance")
+            if keep(r[0])
+        ],
     }
 
 

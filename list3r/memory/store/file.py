@@ -86,6 +86,10 @@ def connected(path: Path, mode: str, *, alone: bool = False) -> Database:
 
     With `alone` it asks for the file for itself until it is told otherwise.
     """
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        raise MemoryFileError(f"the path {path} is not valid UTF-8; rename it") from error
     database = Database(path, mode)
     try:
         database.set_busy_timeout(round(1000 * _WAIT_S))
@@ -174,8 +178,8 @@ def write_empty(path: Path) -> None:
     except apsw.Error as error:
         raise MemoryFileError(explained(path, error)) from error
     finally:
-        if new is not None:
-            new.unlink(missing_ok=True)
+        for end in ("", "-wal", "-shm", "-journal") if new is not None else ():
+            Path(f"{new}{end}").unlink(missing_ok=True)
 
 
 def taken(path: Path) -> str:
