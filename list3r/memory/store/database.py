@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import apsw
 
-from list3r.memory.store.pages import PageDamaged, Sealing, WatchedFile, check_state, unsealed
+from list3r.memory.store.pages import PageDamaged, WatchedFile, check_state, seal, unsealed
 
 FAILURES = (apsw.Error, UnicodeError)
 """What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
@@ -27,7 +27,6 @@ class Database(apsw.Connection):
         self._watched = WatchedFile()
         flags = _FLAGS[mode] | apsw.SQLITE_OPEN_URI
         super().__init__(f"file:{quote(bytes(path.resolve()))}?mode={mode}", flags, self._watched.name)
-        self._sealing = Sealing(self, self._watched)
         self._version: int | None = None
         self._broken: PageDamaged | None = None
         self.wal_autocheckpoint(0)
@@ -64,7 +63,7 @@ class Database(apsw.Connection):
 
     def commit(self) -> None:
         """End a transaction that wrote, with the sums of the pages that it changed."""
-        sums, watched = self._sealing.seal(), self._watched
+        sums, watched = seal(self, self._watched), self._watched
         self.execute("COMMIT")
         if sums is not None:
             watched.sums = sums
@@ -105,6 +104,7 @@ class Database(apsw.Connection):
         self._watched.count = bytes
         with contextlib.suppress(apsw.IOError, apsw.BusyError):
             super().close(force)
+        self._watched.unregister()
 
     def trust(self) -> None:
         """Take pages as they are from now on: the sums of them are damaged themselves."""

@@ -204,44 +204,31 @@ class _Log(apsw.VFSFile):
         return int.from_bytes(super().xRead(4, offset - _FRAME_HEADER), "big")
 
 
-class Sealing:
-    """Writes the sums of what a transaction changed, as its last act."""
+def seal(database: apsw.Connection, watched: WatchedFile) -> Sums | None:
+    """Write the sums of what a transaction changed, as its last act; what they are once it is committed, None where it
+    changed nothing.
 
-    def __init__(self, database: apsw.Connection, watched: WatchedFile) -> None:
-        self._database = database
-        self._watched = watched
-
-    def seal(self) -> Sums | None:
-        """Write them, inside the transaction; what they are once it is committed, None where it changed nothing.
-
-        What SQLite writes is known when it is written, so that comes first. Then the table of sums is written, until
-        that changes no other sum: a new row may take a page. The sum of a page of this table does not change with what
-        its rows say, for a CRC over something and its own CRC is always the same.
-        """
-        watched = self._watched
-        self._database.execute("SAVEPOINT whole; RELEASE whole")  # the words are written as late as that
-        self._database.cache_flush()
-        if not watched.written and self._state() == watched.sums.rows.get(_STATE):
-            return None
-        sums = Sums(watched.sums.rows)
-        while True:
-            rows = sums.changed({page: found for page, found in watched.written.items() if found != sums.of(page)})
-            rows[_STATE] = self._state()
-            sums.rows |= rows
-            self._write(rows)
-            self._database.cache_flush()
-            if rows[_STATE] == self._state() and watched.agrees(sums):
-                return sums
-
-    def _write(self, rows: Mapping[int, bytes]) -> None:
+    What SQLite writes is known when it is written, so that comes first. Then the table of sums is written, until that
+    changes no other sum: a new row may take a page. The sum of a page of this table does not change with what its rows
+    say, for a CRC over something and its own CRC is always the same.
+    """
+    database.execute("SAVEPOINT whole; RELEASE whole")  # the words are written as late as that
+    database.cache_flush()
+    if not watched.written and state(database) == watched.sums.rows.get(_STATE):
+        return None
+    sums = Sums(watched.sums.rows)
+    while True:
+        rows = sums.changed({page: found for page, found in watched.written.items() if found != sums.of(page)})
+        rows[_STATE] = state(database)
+        sums.rows |= rows
         for first, held in rows.items():
             blob = sealed(first, held)
-            self._database.execute("UPDATE pages SET sums = ? WHERE first = ?", (blob, first))
-            if not self._database.changes():
-                self._database.execute("INSERT INTO pages VALUES (?, ?)", (first, blob))
-
-    def _state(self) -> bytes:
-        return state(self._database)
+            database.execute("UPDATE pages SET sums = ? WHERE first = ?", (blob, first))
+            if not database.changes():
+                database.execute("INSERT INTO pages VALUES (?, ?)", (first, blob))
+        database.cache_flush()
+        if rows[_STATE] == state(database) and watched.agrees(sums):
+            return sums
 
 
 def state(database: apsw.Connection) -> bytes:
