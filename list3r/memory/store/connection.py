@@ -290,7 +290,9 @@ class Connection:
             with self.snapshot():
                 return list(damage_of(self._database))
         except MemoryFileError as error:
-            return [str(error.__cause__ or error)]
+            if error.__cause__ is None:
+                raise
+            return [str(error.__cause__)]
 
     def _check_process(self) -> None:
         """Raise `MemoryFileError` in a forked child: the locks of the file are those of its parent."""
