@@ -120,7 +120,7 @@ class Store:
     @cached_property
     def ids(self) -> Ids:
         """What ids stand for today."""
-        return Ids(self.connection, self.facts, self.edits)
+        return Ids(self.connection, self.facts)
 
     @cached_property
     def embeddings(self) -> Embeddings:
@@ -150,8 +150,7 @@ class Store:
     @cached_property
     def instances(self) -> Instances:
         """The instances of the library."""
-        of_instance = self.embeddings, self.relations, self.events, self.detected_labels
-        return Instances(self.connection, self.ids, self.library, self.words, of_instance)
+        return Instances(self.connection, self.ids, self.words)
 
     @cached_property
     def observations(self) -> Observations:

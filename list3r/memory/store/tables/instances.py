@@ -20,7 +20,7 @@ from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.labels import DetectedLabels
-from list3r.memory.store.tables.library import LibraryState
+from list3r.memory.store.tables.library import Anchors, LooksTable
 from list3r.memory.store.tables.relations import RelationTable
 from list3r.memory.store.tables.words import Words
 
@@ -119,20 +119,10 @@ def _ranks(rows: Sequence[tuple[Any, ...]]) -> Ranks:
 class Instances:
     """The table of instances and the R*Tree of their boxes. What writes is called inside `transaction()`."""
 
-    def __init__(
-        self,
-        connection: Connection,
-        ids: Ids,
-        library: LibraryState,
-        words: Words,
-        of_instance: tuple[Embeddings, RelationTable, Events, DetectedLabels],
-    ) -> None:
-        """`of_instance` are the tables whose rows go with an instance."""
+    def __init__(self, connection: Connection, ids: Ids, words: Words) -> None:
         self._connection = connection
         self._ids = ids
-        self._library = library
         self._words = words
-        self._embeddings, self._relations, self._events, self._labels = of_instance
         self._rows = Table(connection, "instances", _COLUMNS, "id")
         self._ranked = _ranks([])
         self._ranked_in: object = None
@@ -173,12 +163,10 @@ class Instances:
         self._rows.delete("id = ?", (instance_id,))
         self._connection.execute("DELETE FROM instance_boxes WHERE id = ?", (instance_id,))
         self._words.drop(instance_id)
-        self._embeddings.drop(instance_id)
-        self._library.anchors.drop(instance_id)
-        self._library.looks.drop(instance_id)
-        self._labels.drop(instance_id)
-        self._relations.drop(instance_id)
-        self._events.drop(instance_id, alias_of)
+        for table in (Embeddings, Anchors, LooksTable, DetectedLabels):
+            table(self._connection).drop(instance_id)
+        RelationTable(self._connection, self._ids).drop(instance_id)
+        Events(self._connection).drop(instance_id, alias_of)
         if alias_of is not None:
             self._ids.add_aliases({instance_id: alias_of})
 
