@@ -147,6 +147,23 @@ def test_a_page_of_an_earlier_state_is_refused(make_memory: Make) -> None:
     assert len(refused) > 1
 
 
+def test_sums_of_an_earlier_state_are_refused_with_what_they_are_of(make_memory: Make) -> None:
+    path = make_memory()
+    older = path.read_bytes()
+    with Store.open(path, writable=True) as store:
+        edits.label(store, 2, "plate")
+    newer = path.read_bytes()
+    with contextlib.closing(connected(path, "ro")) as read:
+        query = "SELECT pageno FROM dbstat WHERE name IN ('pages', 'instances')"
+        pages = [n - 1 for (n,) in read.execute(query).fetchall()]
+    mixed = bytearray(newer)
+    for page in pages:
+        mixed[page * PAGE_BYTES : (page + 1) * PAGE_BYTES] = older[page * PAGE_BYTES : (page + 1) * PAGE_BYTES]
+    path.write_bytes(mixed)
+    with pytest.raises(MemoryFileError, match="first page"), Store.open(path) as store:
+        store.instances.all()
+
+
 def test_a_log_of_another_state_is_refused(make_memory: Make, tmp_path: Path) -> None:
     path, other = make_memory(), tmp_path / "other.l3r"
     shutil.copy(path, other)

@@ -209,13 +209,13 @@ def _chosen_space(store: Store, space: str | None) -> str:
 
 def _made(store: Store, space: str) -> VectorIndex:
     """Return an index of all that is there, or one that was kept and that little has changed since."""
-    count, changes, rollbacks = store.embeddings.count(space), store.embeddings.changes(), store.connection.rollbacks
     dimension = next(store.embeddings.batches(space, 1))[1].shape[1]
+    if (kept := _kept(store, space, dimension)) is not None and kept._caught_up(store):
+        return kept
+    count, changes, rollbacks = store.embeddings.count(space), store.embeddings.changes(), store.connection.rollbacks
     if count <= _EXACT:
         ids, vectors = store.embeddings.all(space)
         return VectorIndex(space, dimension, count, _AllVectors(ids, _unit(vectors)), changes, rollbacks, changes)
-    if (kept := _kept(store, space, dimension)) is not None and kept._caught_up(store):
-        return kept
     index = _filled(store, space, count)
     found = VectorIndex(space, dimension, count, _Cells(index), changes, rollbacks, changes)
     if store.embeddings.of_the_file():
@@ -244,11 +244,11 @@ def _cell_count(count: int) -> int:
 
 def _kept(store: Store, space: str, dimension: int) -> VectorIndex | None:
     """Return the index that was kept of this memory; None where there is none of use."""
+    path = _cache_file(store.path, space)
+    if not path.exists() or not store.embeddings.of_the_file():
+        return None
     import faiss
 
-    path = _cache_file(store.path, space)
-    if not store.embeddings.of_the_file():
-        return None
     with contextlib.suppress(RuntimeError, OSError, ValueError, KeyError, TypeError):
         told = json.loads(path.with_suffix(".json").read_text())
         marks = {int(n): crc for n, crc in told["marks"].items()}

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import apsw
 
-from list3r.memory.store.pages import PageDamaged, WatchedFile, check_state, seal, unsealed
+from list3r.memory.store.pages import PageDamaged, WatchedFile, check_state, schema_of, seal, unsealed
 
 FAILURES = (apsw.Error, UnicodeError)
 """What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
@@ -96,7 +96,8 @@ class Database(apsw.Connection):
         self.execute("BEGIN IMMEDIATE")
         self.execute("PRAGMA integrity_check").fetchall()
         self._watched.written, self._watched.unjudged, self._watched.checking = self._watched.unjudged, None, False
-        self.execute("DELETE FROM pages")
+        version = int(self.execute("PRAGMA user_version").fetchall()[0][0])  # type: ignore[arg-type]
+        self.execute(f"DELETE FROM pages; PRAGMA user_version = {schema_of(version)}")
         self.commit()
 
     def close(self, force: bool = False) -> None:

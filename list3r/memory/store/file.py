@@ -15,7 +15,7 @@ import apsw
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.database import Database
-from list3r.memory.store.pages import PageDamaged
+from list3r.memory.store.pages import PageDamaged, schema_of
 from list3r.memory.store.rows.codec import MAX_BLOB_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
 
@@ -127,7 +127,7 @@ def numbers(database: Database) -> tuple[int, int]:
         int(database.execute(f"PRAGMA {name}").fetchall()[0][0])  # type: ignore[arg-type]
         for name in ("application_id", "user_version")
     )
-    return application, version
+    return application, schema_of(version)
 
 
 def check_numbers(path: Path, application: int, version: int) -> None:

@@ -5,8 +5,8 @@ So a flipped byte, a page that was zeroed or swapped, and one of another state o
 reads them, be they of a table, an index, the R*Tree or the words; and none is written over unseen.
 
 A file system of our own between SQLite and the disk (`apsw.VFS`) sees each page as it is read or written. Each row of
-the table of sums ends with a sum of its own. Page 1 is only seen as a transaction ends; what it holds, the schema and
-how many pages there are and are free, is summed as a row of its own.
+the table of sums ends with a sum of its own. Page 1 is only seen as a transaction ends; what it holds, the schema, how
+many pages there are and are free, and how many transactions there were, is summed as a row of its own.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ _LOG_HEADER = 32
 _FILE_HEADER = 100
 _SIZE_AT = slice(16, 18)
 _COUNT_AT = slice(24, 28)
+_SCHEMA, _MOST_VERSION = 0xFF, 0x7FFFFFFF
 _numbers = count()
 
 
@@ -66,7 +67,7 @@ def unsealed(rows: Iterable[tuple[int, bytes]]) -> dict[int, bytes]:
     """Return the sums that rows hold. Raises `PageDamaged`."""
     found = {}
     for first, blob in rows:
-        if sealed(first, blob[:-4]) != blob:
+        if type(first) is not int or type(blob) is not bytes or sealed(first, blob[:-4]) != blob:
             raise PageDamaged("the sums of its pages are damaged")
         found[first] = blob[:-4]
     return found
@@ -217,6 +218,7 @@ def seal(database: apsw.Connection, watched: WatchedFile) -> Sums | None:
     if not watched.written and state(database) == watched.sums.rows.get(_STATE):
         return None
     sums = Sums(watched.sums.rows)
+    _count_on(database)
     while True:
         rows = sums.changed({page: found for page, found in watched.written.items() if found != sums.of(page)})
         rows[_STATE] = state(database)
@@ -231,8 +233,23 @@ def seal(database: apsw.Connection, watched: WatchedFile) -> Sums | None:
             return sums
 
 
+def schema_of(user_version: int) -> int:
+    """Return the version of the schema; what is above it counts transactions, so that the first page tells one state of
+    the file from another.
+    """
+    return user_version & _SCHEMA
+
+
+def _count_on(database: apsw.Connection) -> None:
+    version = int(database.execute("PRAGMA main.user_version").fetchall()[0][0])  # type: ignore[arg-type]
+    after = (version & ~_SCHEMA) + _SCHEMA + 1 & _MOST_VERSION
+    database.execute(f"PRAGMA main.user_version = {after | schema_of(version)}")
+
+
 def state(database: apsw.Connection) -> bytes:
-    """Return a sum of what page 1 says: the schema with where its tables lie, how many pages there are and are free."""
+    """Return a sum of what page 1 says: the schema with where its tables lie, how many pages there are and are free,
+    and the count of transactions.
+    """
     schema = database.execute("SELECT type, name, rootpage, sql FROM main.sqlite_master ORDER BY rowid").fetchall()
     numbers = [
         database.execute(f"PRAGMA main.{name}").fetchall()
