@@ -3,8 +3,8 @@
     python scripts/house.py                     # of this checkout
     python scripts/house.py OTHER [OTHER ...]   # of other checkouts beside it, one column each
 
-Printed as a table of Markdown; docs/design.md holds it before and after the redesign of the rooms. Lines are also
-counted room by room: those that stood at the redesign, and the wings that were built since (`WINGS`).
+Printed as a table of Markdown. Lines are also counted room by room:
+those that stood at the redesign, and the wings that were built since (`WINGS`).
 """
 
 from __future__ import annotations
