@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from list3r.batch.engines.base import TaskResources, make_engine
+from list3r.batch.engines.base import TaskResources
+from list3r.batch.engines.choice import make_engine
 from list3r.batch.engines.local import LocalEngine
 from list3r.batch.ledger import Ledger
 from list3r.batch.runner import BatchReport, BatchSettings, run_batch, run_here

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.bar import ProgressBar, progress_bar
-from list3r.cli.terminal import note, say
+from list3r.cli.bar import progress_bar
+from list3r.cli.terminal import ProgressBar, note, say
 from list3r.pipeline.request import Watch
 
 if TYPE_CHECKING:

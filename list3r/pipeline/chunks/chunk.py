@@ -32,7 +32,8 @@ from list3r.models.cache import locate
 from list3r.models.device import out_of_memory_reported
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
-from list3r.reconstruction.features.learned import LearnedDetector, make_detector
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.keyframe_record import FrameLook, KeyframeNetworks, frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, entry, import_model, make_reconstructor
 

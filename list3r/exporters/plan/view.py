@@ -1,49 +1,55 @@
-"""Choose how the world lies on the page of a plan view."""
+"""Choose how the world is turned on the page of a plan view."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.components import Component, has_box
-from list3r.memory.records import Instance
+from list3r.memory.records import Instance, Support
 
 Array = NDArray[np.float64]
-
-VERTICAL_KINDS = ("wall",)
 FLAT_KINDS = ("floor", "ceiling")
 
 
 @dataclass(frozen=True)
-class PlanFrame:
+class PlanView:
     """An orthographic view from above."""
 
     R_plan_world: Array
     """Rows: the page's right, the page's up, towards the reader. Shape (3, 3)."""
-    center: Array
-    """Plan coordinates of the middle of the map, world units. Shape (2,)."""
-    pixels_per_unit: float
-    size_px: tuple[int, int]
-    """(width, height) of the map."""
+    low: Array
+    """Lower left corner of the map, plan coordinates, world units. Shape (2,)."""
+    high: Array
+    """Upper right corner. Shape (2,)."""
     note: str
     """What is up in the picture."""
 
-    def reduced(self, times: int) -> PlanFrame:
-        """Return the same view in this many times fewer pixels each way."""
-        width, height = self.size_px
-        return replace(self, pixels_per_unit=self.pixels_per_unit / times, size_px=(width // times, height // times))
-
-    def to_px(self, points_world: ArrayLike) -> Array:
-        """Return the pixel positions (x right, y down) of world points. Shape (N, 3) -> (N, 2)."""
-        xy = np.asarray(points_world, dtype=np.float64) @ self.R_plan_world[:2].T - self.center
-        half = np.array(self.size_px) / 2.0
-        return np.asarray(half + xy * self.pixels_per_unit * [1.0, -1.0])
+    def on_page(self, points_world: ArrayLike) -> Array:
+        """Return plan coordinates of world points. Shape (..., 3) -> (..., 2)."""
+        return np.asarray(np.asarray(points_world, np.float64) @ self.R_plan_world[:2].T)
 
     def height(self, points_world: ArrayLike) -> Array:
-        """Return the height above the page, world units. Shape (N, 3) -> (N,)."""
-        return np.asarray(np.asarray(points_world, dtype=np.float64) @ self.R_plan_world[2])
+        """Return the height above the page, world units. Shape (..., 3) -> (...)."""
+        return np.asarray(np.asarray(points_world, np.float64) @ self.R_plan_world[2])
+
+    @property
+    def shows_world_axes(self) -> bool:
+        """Whether the page is a plane of world x and y, so that it can be marked with their values."""
+        return bool(self.R_plan_world[2, 2] > 1 - 1e-9)
+
+
+def choose_view(component: Component, supports: dict[int, Support], gravity: str) -> PlanView:
+    """Look down, with the walls along the page, everything inside, and the longer side across."""
+    rotation, note = choose_rotation(component, gravity)
+    low, high = _extent(component, supports, rotation)
+    if high[1] - low[1] > high[0] - low[0]:
+        rotation = np.stack([rotation[1], -rotation[0], rotation[2]])
+        low, high = _extent(component, supports, rotation)
+    margin = 0.03 * np.maximum(high - low, 1e-6).max()
+    return PlanView(rotation, low - margin, high + margin, note)
 
 
 def choose_rotation(component: Component, gravity: str) -> tuple[Array, str]:
@@ -55,11 +61,6 @@ def choose_rotation(component: Component, gravity: str) -> tuple[Array, str]:
     angle = _dominant_angle(component, rotation)
     c, s = np.cos(-angle), np.sin(-angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation, note
-
-
-def quarter_turn(rotation: Array) -> Array:
-    """Return the same view with the page turned by a quarter. Shape (3, 3)."""
-    return np.stack([rotation[1], -rotation[0], rotation[2]])
 
 
 def _up(component: Component, gravity: str) -> tuple[Array, str]:
@@ -92,8 +93,20 @@ def _dominant_angle(component: Component, rotation: Array) -> float:
 
 
 def is_wall(instance: Instance, up: Array) -> bool:
-    """Tell whether an instance is structure that stands upright, by its kind or else by the thin side of its box."""
+    """Tell whether an instance is upright structure, by its kind or else by the thin side of its box."""
     if not instance.structure or instance.structure in FLAT_KINDS or not has_box(instance):
         return False
     thin = instance.box.rotation[:, int(np.argmin(instance.box.size))]
-    return instance.structure in VERTICAL_KINDS or abs(float(thin @ up)) < 0.5
+    return instance.structure == "wall" or abs(float(thin @ up)) < 0.5
+
+
+def _extent(component: Component, supports: dict[int, Support], rotation: Array) -> tuple[Array, Array]:
+    """Return lower and upper corner, plan coordinates, of boxes of instances, camera, and structure but its fringe."""
+    page = rotation[:2].T
+    parts = [i.box.corners() @ page for i in component.instances if not i.structure and has_box(i)]
+    parts += [S_world_cam.translation[None] @ page for _, S_world_cam in component.poses]
+    for i in component.instances:
+        if i.structure and len(supports[i.id].points):
+            parts.append(np.quantile(supports[i.id].points @ page, [0.01, 0.99], axis=0))
+    flat = np.concatenate(parts) if parts else np.array([[-1.0, -1.0], [1.0, 1.0]])
+    return flat.min(axis=0), flat.max(axis=0)

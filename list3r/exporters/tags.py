@@ -1,4 +1,4 @@
-"""Place the tags of a plan view so that every one can be read."""
+"""Place tags on a picture so that every one can be read."""
 
 from __future__ import annotations
 
