@@ -3,7 +3,7 @@
     PYTHONPATH=. python benchmarks/slow_clients.py --clients 200 --seconds 60 --json FILE
 
 A fifth of the slow ones each: send nothing; send a byte of their headers a second; the same after a first request that
-was answered; send a byte of a body a second; ask twenty times and take no answer. The third and the fifth kind have a
+was answered; send a byte of a body a second; ask once a second and take no answer. The third and the fifth kind have a
 token. Whichever is cut connects anew at once. The client that is not slow asks over a new connection each time, and
 over one that it keeps as long as the service does.
 """
@@ -149,10 +149,9 @@ def _slow(port: int, count: int, ready: Event, connected: Any) -> None:
                 if not more:
                     return
         if kind == 4:
-            await loop.sock_sendall(client, 20 * asked.encode())
             while True:  # until that fails
+                await loop.sock_sendall(client, asked.encode())
                 await asyncio.sleep(1.0)
-                await loop.sock_sendall(client, b"G")
         await loop.sock_sendall(client, BEGUN + (b"Content-Length: 1000\r\n\r\n" if kind == 3 else b""))
         while True:
             await loop.sock_sendall(client, b"x")

@@ -33,7 +33,7 @@ class ServiceLimits:
 
     request_bytes: int = 256 * 1024
     request_s: float = 10.0
-    """For the headers of a request, from the connection or the last answer on; as long again for its body and answer."""
+    """For the headers of a request, from the connection or the last answer on; again as much for body and answer."""
     at_once: int = 64
     """Requests that one process answers; one that is still arriving does not count."""
     open_at_once: int = 512

@@ -57,7 +57,7 @@ def serve(
 def server_config(app: str | Application, limits: ServiceLimits, **words: Any) -> uvicorn.Config:
     """Return how uvicorn serves an application within limits."""
     return uvicorn.Config(
-        app,  # type: ignore[arg-type]
+        app,
         http=functools.partial(BoundedProtocol, limits=limits),  # type: ignore[arg-type]
         ws="none",
         log_level="warning",
