@@ -148,6 +148,35 @@ def test_what_makes_no_sense_is_explained(service: Service, path: str, status: i
     assert "\n" not in found[1]["error"]["message"]
 
 
+@pytest.mark.parametrize(
+    ("asked", "status", "said"),
+    [
+        ({"vector": [1.0] * 15}, 400, "15 numbers does not belong to test@1/16"),
+        ({"vector": [1.0] * 16, "space": "none@1/16"}, 400, "no vectors of none@1/16"),
+        ({"vector": [0.0] * 16}, 400, "not all zero"),
+        ({"vector": [float("inf")] * 16}, 400, "finite numbers"),
+        ({"vector": [1.0] * 16, "memory": "../../x"}, 404, "no memory"),
+    ],
+)
+def test_vectors_that_cannot_be_compared_are_explained(
+    service: Service, asked: dict[str, Any], status: int, said: str
+) -> None:
+    found = service.get("/v1/similar", method="POST", body={"space": "test@1/16"} | asked)
+    assert found[0] == status == found[1]["error"]["status"]
+    assert said in found[1]["error"]["message"]
+
+
+@pytest.mark.parametrize("length", [1e38, 1e-38, 1e300])
+def test_how_long_a_vector_is_does_not_matter(service: Service, length: float) -> None:
+    vector = [float(n % 3 - 1) for n in range(16)]
+    told = [
+        service.get("/v1/similar", method="POST", body={"vector": [by * x for x in vector], "space": "test@1/16"})
+        for by in (1.0, length)
+    ]
+    assert told[0][0] == 200 and told[0][1]["matches"]
+    assert told[1] == told[0]
+
+
 @pytest.mark.parametrize("text", ["x'; DROP TABLE memory; --", "%s%s", "\x00", '") OR 1=1', "../../etc/passwd"])
 def test_what_is_asked_is_never_part_of_a_statement(service: Service, text: str) -> None:
     for path in ("/v1/find?text={}", "/v1/memories/{}", "/v1/relations?subject={}", "/v1/find?text=mug&memory={}"):
