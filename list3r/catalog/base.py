@@ -73,6 +73,10 @@ class Backend(Protocol):
         """Return the names of spaces that hold vectors."""
         ...
 
+    def dimension(self, space: str) -> int | None:
+        """Return how many numbers the vectors of a space have; None where it has none."""
+        ...
+
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
         """Return the vector of an instance. Shape (D,)."""
         ...
@@ -80,7 +84,7 @@ class Backend(Protocol):
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogThing, float]]:
-        """Return the k whose vectors are most like one, with the cosine, the most alike first."""
+        """Return the k whose vectors are most like one of length 1, with the cosine, the most alike first."""
         ...
 
     def alive(self) -> bool:

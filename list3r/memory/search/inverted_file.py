@@ -6,8 +6,9 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 
 
@@ -82,7 +83,28 @@ class InvertedFile:
             del self._unread[n]
 
 
-def unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return vectors of length 1, of zeros where a vector is. Shape (n, D)."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.ascontiguousarray(vectors / np.maximum(length, 1e-12), dtype=np.float32)
+def unit(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return vectors of length 1, of zeros where a vector is; of any finite numbers. Shape (n, D)."""
+    with np.errstate(over="ignore", under="ignore"):
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    out = np.ascontiguousarray(vectors / np.where(length > 0.0, length, 1.0), dtype=np.float32)
+    odd = ~((length > 1e-12) & (length < np.inf))[:, 0]  # squares of these cannot be added up as they are
+    if odd.any():
+        scale = np.abs(vectors[odd]).max(axis=1, keepdims=True)
+        scaled = vectors[odd].astype(np.float64) / np.where(scale > 0.0, scale, 1.0)
+        out[odd] = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1.0)
+    return out
+
+
+def unit_query(vector: ArrayLike) -> NDArray[np.float32]:
+    """Return a vector to compare with at length 1. Shape (D,).
+
+    Raises `OptionError` for what is not a row of finite numbers, or all zero.
+    """
+    try:
+        asked = np.asarray(vector, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        asked = np.zeros(0)
+    if asked.shape[-1:] != (asked.size,) or not np.isfinite(asked).all() or not asked.any():
+        raise OptionError("the vector to compare with must be a row of finite numbers, not all zero")
+    return np.ravel(unit(asked.reshape(1, -1)))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.search.all_vectors import AllVectors
-from list3r.memory.search.inverted_file import InvertedFile, unit
+from list3r.memory.search.inverted_file import InvertedFile, unit, unit_query
 from list3r.memory.search.vector_cells import Cells, cache_file, cell_count, sample_size
 from list3r.memory.store.store import Store
 
@@ -97,7 +97,12 @@ class VectorIndex:
 
         `passing` says which of some ids may answer; it is asked about as few as it takes.
         """
-        query = self._checked(vector)
+        query = unit_query(vector)
+        if len(query) != self.dimension:
+            raise SpaceMismatchError(
+                f"a vector of {len(query)} numbers cannot be compared in the space {self.space}, "
+                f"which has {self.dimension}"
+            )
         width, probed = max(4 * k, _RANKED), max(_PROBED, -(-_LOOKED_AT * cell_count(self.count) // max(self.count, 1)))
         while True:
             found = self._ranked(store, query, width, probed)
@@ -124,18 +129,6 @@ class VectorIndex:
         if len(ids) == 0:
             raise OptionError(f"instance {instance_id} has no vector in the space {self.space}")
         return np.asarray(vectors[0])
-
-    def _checked(self, vector: ArrayLike) -> NDArray[np.float32]:
-        query = np.asarray(vector, dtype=np.float32).ravel()
-        if len(query) != self.dimension:
-            raise SpaceMismatchError(
-                f"a vector of {len(query)} numbers cannot be compared in the space {self.space}, "
-                f"which has {self.dimension}"
-            )
-        length = float(np.linalg.norm(query))
-        if not np.isfinite(length) or length == 0.0:
-            raise OptionError("the vector to compare with must be finite and not zero")
-        return np.asarray(query / length)
 
 
 def _first(
