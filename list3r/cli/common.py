@@ -6,6 +6,7 @@ import contextlib
 import functools
 import inspect
 import math
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
@@ -170,7 +171,7 @@ _DRAWN_ROWS = 200
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
     """Left-aligned columns under a header; a word where there are no rows. A short table on a terminal is drawn."""
-    shown_rows = [[f"{v:.3f}" if isinstance(v, float) else shown(v) for v in row] for row in rows]
+    shown_rows = [[f"{v:.3f}" if isinstance(v, float) else _cell(v) for v in row] for row in rows]
     if not shown_rows:
         say("nothing found")
         return
@@ -185,3 +186,8 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _cell(value: object) -> str:
+    """A value within a table; more than one blank between two words would look like the gap between columns."""
+    return re.sub(r"(?<=\S) ( +)(?=\S)", lambda gap: " " + r"\x20" * len(gap[1]), shown(value))
