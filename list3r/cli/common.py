@@ -171,7 +171,7 @@ _DRAWN_ROWS = 200
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
     """Left-aligned columns under a header; a word where there are no rows. A short table on a terminal is drawn."""
-    shown_rows = [[f"{v:.3f}" if isinstance(v, float) else _cell(v) for v in row] for row in rows]
+    shown_rows = [[f"{v:.3f}" if isinstance(v, float) else shown(v) for v in row] for row in rows]
     if not shown_rows:
         say("nothing found")
         return
@@ -188,6 +188,8 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-def _cell(value: object) -> str:
-    """A value within a table; more than one blank between two words would look like the gap between columns."""
-    return re.sub(r"(?<=\S) ( +)(?=\S)", lambda gap: " " + r"\x20" * len(gap[1]), shown(value))
+def in_column(name: str) -> str:
+    """Return what somebody called a thing for a table: of blanks in a row, which look like the gap between columns,
+    only the first stays one.
+    """
+    return re.sub(r"(?<= ) +", lambda blanks: r"\x20" * len(blanks[0]), name)
