@@ -35,7 +35,7 @@ STRANGE = ("x'; DROP TABLE memory; --", '"%s ? $1 {}', "\\", "a\x00b", "mug' OR 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
-    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'list3r[catalog]'")
+    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install '.[catalog]'")
     with running_postgres() as found:
         yield found
 

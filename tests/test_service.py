@@ -53,7 +53,7 @@ class Service:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    pytest.importorskip("fastapi", reason="fastapi is not installed: pip install 'list3r[serve]'")
+    pytest.importorskip("fastapi", reason="fastapi is not installed: pip install '.[serve]'")
     folder = tmp_path_factory.mktemp("service")
     with Catalog.open(str(folder / "catalog.sqlite")) as catalog:
         for name in ("one", "two"):

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import inspect
 import math
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
@@ -185,3 +186,10 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     for row in cells:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def in_column(name: str) -> str:
+    """Return what somebody called a thing for a table: of blanks in a row, which look like the gap between columns,
+    only the first stays one.
+    """
+    return re.sub(r"(?<= ) +", lambda blanks: r"\x20" * len(blanks[0]), name)

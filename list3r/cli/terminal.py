@@ -70,6 +70,8 @@ def prepare_streams() -> None:
             os.fstat(descriptor)
         except OSError:
             os.dup2(os.open(os.devnull, mode), descriptor)
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:

@@ -28,7 +28,7 @@ from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color,
 from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line, install_hint
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -221,7 +221,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise OptionError(f"{path} is a ROS recording, which needs a package: pip install 'list3r[ros]'") from None
+        raise OptionError(f"{path} is a ROS recording, which needs a package: {install_hint('ros')}") from None
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):

@@ -9,7 +9,7 @@ import socket
 import stat
 import sys
 import weakref
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +136,7 @@ def _me() -> dict[str, object]:
         "pid": os.getpid(),
         "host": socket.gethostname(),
         "program": " ".join([program, *words]),
-        "since": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 
