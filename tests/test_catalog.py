@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from list3r.catalog import Catalog
-from list3r.catalog.base import open_backend
+from list3r.catalog.backends import open_backend
 from list3r.catalog.catalog import box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors

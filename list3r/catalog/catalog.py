@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.batch.storage import Output, is_remote
-from list3r.catalog.base import MOST_RANKED, Backend, open_backend
+from list3r.catalog.backends import open_backend
+from list3r.catalog.base import MOST_RANKED, Backend
 from list3r.catalog.reading import printable, read_content
 from list3r.catalog.records import (
     CatalogAnswers,

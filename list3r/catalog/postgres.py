@@ -39,7 +39,7 @@ _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
 _WIDE, _LISTS_OF_WIDE = 128, 20
 """Vectors with more numbers than the first are searched in as many lists as the second says, instead of 40: they take
-longer to compare, and fewer lists find as many. docs/decisions/0141-lists-of-vectors.md."""
+longer to compare, and fewer lists find as many. research/storage 0141."""
 _WRITTEN = "written"
 _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""

@@ -166,7 +166,7 @@ def _given(group: Any, name: str, value: Any) -> Any:
 
 
 _DRAWN_ROWS = 200
-"""Rows of a table that is drawn: half a millisecond of processor time each (docs/decisions/0004)."""
+"""Rows of a table that is drawn: half a millisecond of processor time each (research/speed 0004)."""
 
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:
