@@ -81,7 +81,8 @@ class FolderSource(Reader):
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
-        self._info = self._describe(root, (*notes, *self._doubts()))
+        self._empty: dict[int, str] = {}
+        self._info = self._describe(root, notes)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
@@ -231,13 +232,24 @@ class FolderSource(Reader):
         )
 
     def _file_doubts(self) -> tuple[str, ...]:
-        """Of files spread over the source, those that cannot be read; steps that are not even miss no pattern."""
-        files = self._layout.files
-        some = [files[int(k)] for k in np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round())]
+        """Return how many files are empty or missing, and of others spread over the source, those that cannot be read.
+
+        Steps that are not even miss no pattern.
+        """
+        files, empty = self._layout.files, self._empty
+        out = []
+        if empty:
+            first, reason = next(iter(empty.items()))
+            rest = ", and those of all frames behind it" if len(empty) == len(files) - first > 1 else ""
+            out.append(
+                f"{len(empty)} of {len(files)} frames cannot be used: the first is frame {first} ({reason}){rest}"
+            )
+        tried = np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round()).astype(int).tolist()
+        some = [files[k] for k in tried if k not in empty]
         faults = [found for f in some if (found := fault_of(f.color) or (fault_of(f.depth) if f.depth else None))]
-        if not faults:
-            return ()
-        return (f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]}); is the copy complete?",)
+        if faults:
+            out.append(f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]})")
+        return tuple(f"{found}; is the copy complete?" for found in out)
 
     def _scale_doubts(self) -> tuple[str, ...]:
         """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
@@ -303,7 +315,7 @@ class FolderSource(Reader):
         posed, deep = len(files.that_hold(POSE_FILE | POSE)), len(files.that_hold(DEPTH))
         return (
             *((without_pose(total - posed, total),) if 0 < posed < total else ()),
-            *((without_depth(total - deep, total),) if self._has_depth and deep < total else ()),
+            *((without_depth(files.that_hold(DEPTH), total),) if self._has_depth and deep < total else ()),
         )
 
     def _time_doubts(self) -> tuple[str, ...]:
@@ -317,6 +329,8 @@ class FolderSource(Reader):
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
+        found = fingerprint(layout.kind, self._listing(root), self._options)
+        notes = (*notes, *self._doubts())
         guess, turns = self._camera_guess(), self._turns()
         missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
         if rig.color_size != rig.stored_size:
@@ -340,7 +354,7 @@ class FolderSource(Reader):
             has_depth=self._has_depth,
             has_poses=has_poses,
             scale_kind="metric" if self._has_depth else "relative",
-            fingerprint=fingerprint(layout.kind, _listing(layout.files, root), self._options),
+            fingerprint=found,
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
@@ -353,6 +367,19 @@ class FolderSource(Reader):
             z_up=turns is not None,
             poses_drift=layout.poses_drift,
         )
+
+    def _listing(self, root: Path) -> Iterator[tuple[str, int]]:
+        """Yield names and sizes of all files, and keep which frames have none to read."""
+        above = f"{root}{os.sep}"
+        for number, file in enumerate(self._layout.files):
+            for stored in (p for p in (file.color, file.depth, file.pose) if p is not None):
+                size = stored_size(stored)
+                if size <= 0 and stored is not file.pose:
+                    reason = f"{stored.name} is {'missing' if size else 'empty'}"
+                    self._empty.setdefault(number, reason)
+                isfile = isinstance(stored, Path)
+                name = str(stored).removeprefix(above).replace(os.sep, "/") if isfile else stored.name
+                yield name, size
 
     def _some_files(self) -> list[Stored | CodedArray | None]:
         """Return the files of the first frame, the last and one between."""
@@ -372,9 +399,11 @@ def without_pose(count: int, total: int) -> str:
     return f"{count} of {total} frames have no pose"
 
 
-def without_depth(count: int, total: int) -> str:
-    """That some frames have no depth image, for people."""
-    return f"{count} of {total} frames have no depth image and cannot be used"
+def without_depth(deep: Sequence[int] | NDArray[np.int64], total: int) -> str:
+    """That some frames have no depth image, for people; `deep` are the numbers of those that have, ascending."""
+    missing, ends = total - len(deep), int(deep[-1]) + 1 if len(deep) else 0
+    where = f" (all from frame {ends} on)" if missing == total - ends > 1 else ""
+    return f"{missing} of {total} frames have no depth image and cannot be used{where}"
 
 
 def centred_camera(focal: float, rig: Rig) -> Camera:
@@ -411,13 +440,6 @@ def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
     known = Counter(size for size in sizes if size)
     usual = known.most_common(1)[0][0] if known else ()
     return [files[k] for k in sorted(range(len(files)), key=lambda k: sizes[k] != usual)]
-
-
-def _listing(files: Iterable[FrameFile], root: Path) -> Iterator[tuple[str, int]]:
-    above = f"{root}{os.sep}"
-    for stored in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
-        name = str(stored).removeprefix(above).replace(os.sep, "/") if isinstance(stored, Path) else stored.name
-        yield name, stored_size(stored)
 
 
 def _median_known(raw: NDArray[Any]) -> float:
