@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +91,15 @@ class FolderSource(Reader):
             yield self._read(self._number(position))
 
     def read_some(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but frames at positions that are no multiple of `step` are read when they are looked at."""
+        """As `read`, but frames at positions that are no multiple of `step` are read when they are looked at.
+
+        Of those whose files are known to be empty or missing it is said at once.
+        """
         for position in range(len(self._chosen))[start:stop]:
             number = self._number(position)
-            if position % step:
-                file = self._layout.files[number]
+            file = self._layout.files[number]
+            lacking = number in self._empty or (self._has_depth and file.depth is None)
+            if position % step and not lacking:
                 yield LazyFrame(number, self._time_s(number, file), self._pose(file), partial(self._read, number))
             else:
                 yield self._read(number)
@@ -198,13 +203,22 @@ class FolderSource(Reader):
         return None if T_source_given is None else T_source_given @ self._T_posed_color
 
     def _probe(self, root: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
-        """Image sizes of the first frame that decodes, among the first and some spread over the source."""
-        count = len(self._chosen)
-        spread = np.linspace(0, count - 1, _PROBES).astype(int).tolist()
-        tried = dict.fromkeys([*range(min(3, count)), *spread])
-        paths = [self._layout.files[int(self._chosen.starts[k])] for k in tried]
+        """Image sizes of the first frame that decodes, among the first and some spread over the source.
+
+        Those come first whose picture has the size that most of the ones spread have. Of a stretch of a source in which
+        none decodes the others tell.
+        """
+        files, count = self._layout.files, len(self._chosen)
+        spread = set(np.linspace(0, count - 1, _PROBES).astype(int).tolist())
+        tried = sorted({*range(min(3, count)), *spread})
+        paths = [files[int(self._chosen.starts[k])] for k in tried]
+        sizes = [_size_of(file) for file in paths]
+        known = Counter(size for k, size in zip(tried, sizes, strict=True) if size and k in spread)
+        usual = known.most_common(1)[0][0] if known else ()
+        first = [file for _, file in sorted(zip(sizes, paths, strict=True), key=lambda pair: pair[0] != usual)]
+        others = (files[k] for k in range(0, len(files), -(-len(files) // _PROBES)))
         reason = ""
-        for file in _usual_size_first(paths):
+        for file in chain(first, others if count < len(files) else ()):
             try:
                 color = read_color(file.color, upright=self._layout.upright_tags)
                 self._first_picture = file.color
@@ -429,17 +443,12 @@ def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOp
     return found.hexdigest()[:32]
 
 
-def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
-    """Return the files in order, but those whose picture has not the size that most have behind the others."""
-    sizes = []
-    for file in files:
-        try:
-            sizes.append(read_gray(file.color, 8).shape)
-        except FrameError:
-            sizes.append(())
-    known = Counter(size for size in sizes if size)
-    usual = known.most_common(1)[0][0] if known else ()
-    return [files[k] for k in sorted(range(len(files)), key=lambda k: sizes[k] != usual)]
+def _size_of(file: FrameFile) -> tuple[int, ...]:
+    """Return the size of a picture, an eighth of it; empty where it cannot be decoded."""
+    try:
+        return read_gray(file.color, 8).shape
+    except FrameError:
+        return ()
 
 
 def _median_known(raw: NDArray[Any]) -> float:

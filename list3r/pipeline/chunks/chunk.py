@@ -173,9 +173,10 @@ def _posed(parts: Sequence[Reconstruction]) -> set[int]:
 
 
 def _deep(task: ChunkTask, read: Sequence[Frame | BadFrame]) -> set[int] | None:
-    """Numbers of the frames that get depth; None for all, as where they would be few."""
-    found = {f.index for k, f in enumerate(read, task.span.start) if k % task.depth_every == 0}
-    return None if task.depth_every == 1 or 4 * len(found) < task.settings.chunks.length else found
+    """Numbers of the frames that get depth; None for all, as where they would be few of those that can be used."""
+    every = task.depth_every
+    found = {f.index for k, f in enumerate(read, task.span.start) if k % every == 0 and isinstance(f, Frame)}
+    return None if every == 1 or 4 * len(found) < task.settings.chunks.length else found
 
 
 def _around(task: ChunkTask, source: FrameSource) -> Around | None:
