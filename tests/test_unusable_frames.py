@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -192,15 +193,28 @@ def test_a_live_folder_goes_on_after_a_stretch_without_depth(tmp_path: Path) -> 
 
 
 def test_a_colour_video_with_an_empty_stretch_is_a_memory_of_the_rest(tmp_path: Path) -> None:
-    folder = save(tmp_path / "walk", list(range(24)))
-    for path in sorted(folder.iterdir())[14:]:
+    folder = save(tmp_path / "walk", [*range(14), *[0] * 24])
+    for path in sorted(folder.iterdir())[12:]:
         path.write_bytes(b"")
-    request = BuildRequest(chunk=14, overlap=4, reconstruction="sfm", depth_every=1)
-    report = build(folder, tmp_path / "m.l3r", options=COLOR_OPTIONS, settings=request, run=RunOptions(workers=0))
-    assert (report.posed, report.bad, report.chunks, report.components) == (14, 10, 2, 1)
-    with list3r.open(tmp_path / "m.l3r") as scene:
-        assert scene.store.facts.scale_kind == "relative" and len(scene.store.chunks.blank()) == 0
-        assert len(scene) > 0
+    request = BuildRequest(chunk=14, overlap=2, reconstruction="sfm", depth_every=1)
+    run_options, memories = RunOptions(workers=0), (tmp_path / "all.l3r", tmp_path / "sound.l3r")
+    report = build(folder, memories[0], options=COLOR_OPTIONS, settings=request, run=run_options)
+    build(folder, memories[1], options=replace(COLOR_OPTIONS, stop=12), settings=request, run=run_options)
+    assert (report.posed, report.bad, report.chunks, report.components) == (12, 26, 3, 1)
+    units = []
+    for path in memories:
+        with list3r.open(path) as scene:
+            assert scene.store.facts.scale_kind == "relative" and len(scene) > 0
+            units.append(scene.info()["units_per_metre"])
+            blank = scene.store.chunks.blank()
+    assert units[0] == pytest.approx(units[1], rel=0.01) and units[0] != pytest.approx(1.0, rel=0.02) and not blank
+
+
+def test_where_frames_with_depth_cannot_be_used_the_others_have_it(tmp_path: Path) -> None:
+    folder = write(tmp_path / "walk", range(0, COUNT, 2))
+    request = BuildRequest(chunk=LENGTH, overlap=OVERLAP, depth_every=2)
+    report = build(folder, tmp_path / "m.l3r", options=options(), settings=request, run=RunOptions(workers=0))
+    assert (report.posed, report.bad) == (COUNT // 2, COUNT // 2)
 
 
 # ------------------------------------------------------------------------------------------ what inspect says
