@@ -255,7 +255,9 @@ def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
     known = getattr(summaries, "metre", None)
     if is_known(chunks, summaries):
         return 1.0 if known is None else float(known)
-    units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in sample_of(chunks)]
+    told = [(c, summaries[c.chunk_id]) for c in sample_of(chunks)]
+    seeing = [(c, s) for c, s in told if c.scale_kind == "metric" or len(s.shapes.samples)]
+    units = [float(c.S_world_chunk.scale) * s.unit for c, s in seeing or told]
     return float(np.median(units)) if units else 1.0
 
 

@@ -29,6 +29,14 @@ _encode_samples, _decode_samples = arrays(
 )
 _SAMPLES = joined(("overlap",), ("samples",), lambda s: (_encode_samples(s),), lambda blob: (_decode_samples(blob),))
 
+_BLANK = """
+    SELECT chunk_id FROM chunks c
+    WHERE NOT EXISTS (SELECT 1 FROM keyframes k WHERE k.chunk_id = c.chunk_id)
+      AND NOT EXISTS (SELECT 1 FROM local_instances i WHERE i.chunk_id = c.chunk_id)
+      AND NOT EXISTS (SELECT 1 FROM frames f WHERE f.session_id = c.session_id AND f.chunk_id = c.chunk_id
+                      AND f.frame_index BETWEEN c.first_frame AND c.last_frame AND f.state = 'posed')
+"""
+
 
 @dataclass(frozen=True)
 class _Measured:
@@ -87,14 +95,16 @@ class Chunks:
     def add(self, session_id: int, result: ChunkResult) -> int:
         """Store one chunk as its own component with the identity as `S_world_chunk`; its id.
 
-        Of the frames that it shares with the chunk before, the second half comes to be placed by the new chunk.
+        Of the frames that it shares with the chunk before, the second half comes to be placed by the new chunk. One of
+        whose frames none could be used spans those.
         """
+        seen = result.frame_indices.tolist() or [index for index, _ in result.bad_frames]
         chunk_id = self._measured.add(
             _Measured(
                 session_id,
                 result.index,
-                int(result.frame_indices[0]),
-                int(result.frame_indices[-1]),
+                seen[0],
+                seen[-1],
                 result.intrinsics,
                 result.image_size,
                 result.scale_kind,
@@ -126,6 +136,10 @@ class Chunks:
         if found is None:
             raise MemoryFileError(f"{self._connection.path} has no chunk {chunk_id}")
         return found
+
+    def blank(self) -> frozenset[int]:
+        """Return ids of the chunks that hold nothing: no frame with a pose, no keyframe, no local instance."""
+        return frozenset(int(k) for (k,) in self._connection.rows(_BLANK))
 
     def place(
         self,
