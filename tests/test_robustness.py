@@ -13,6 +13,7 @@ from list3r.cli.build.progress import build_interrupted
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 from tests.program import in_process as run
+from tests.program import with_signals
 from tests.test_cli_errors import write_frames
 
 
@@ -30,7 +31,7 @@ sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given
 main()
 """
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, preexec_fn=with_signals)
 
 
 @pytest.fixture(scope="module")
@@ -166,5 +167,5 @@ main()
     out = tmp_path / "room.json"
     arguments = ["export", str(write_room(tmp_path / "room.l3r")), "--to", "json", "--out", str(out)]
     command = [sys.executable, "-c", program, *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, preexec_fn=with_signals)
     assert (result.returncode, result.stdout, result.stderr.strip()) == (1, "", "interrupted")
