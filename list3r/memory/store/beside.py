@@ -95,8 +95,11 @@ def _log_beside(path: Path) -> tuple[Log | None, bool]:
     for look in range(_LOOKS):
         if look:
             time.sleep(_PAUSE_S)
-        log, mark = Log.read(_log_path(path)), _mark(path)
-        if log is None or log.belongs_to(mark):
+        log = Log.read(_log_path(path))
+        if log is None:
+            break
+        mark = _mark(path)
+        if log.belongs_to(mark):
             return log, True
         if (log, mark) == before:
             break
