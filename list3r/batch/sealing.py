@@ -34,6 +34,9 @@ def seal(memory: Path, sealed: Path, keys: Sequence[str], source: str) -> str:
     try:
         with contextlib.closing(sqlite3.connect(memory)) as database:
             database.execute("VACUUM INTO ?", (str(part),))
+        with contextlib.closing(sqlite3.connect(part, isolation_level=None)) as database:
+            database.execute("PRAGMA secure_delete=ON").fetchall()
+            database.execute("DELETE FROM log_mark")  # a number that is another one each time
     except sqlite3.Error as error:
         part.unlink(missing_ok=True)
         raise MemoryFileError(f"{sealed} cannot be written: {error}") from error

@@ -10,6 +10,7 @@ from list3r.catalog.records import CatalogError, CatalogThing, MemoryContent, Me
 from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
+from list3r.memory.store.beside import has_foreign_log
 from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store
 
@@ -34,7 +35,7 @@ def read_content(path: str, name: str | None = None) -> MemoryContent:
 
 def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryContent:
     log = local.with_name(f"{local.name}-wal")
-    if log.exists() and log.stat().st_size:
+    if log.exists() and log.stat().st_size and not has_foreign_log(local):
         raise CatalogError(
             f"{path} is being written; wait for that to end. If nothing writes it, `list3r repair {path}` completes it"
         )

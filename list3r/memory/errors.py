@@ -28,6 +28,10 @@ class MemoryFileError(List3rError):
     """A memory file that is absent, foreign, damaged, locked, or of a newer schema."""
 
 
+class MemoryFileWarning(UserWarning):
+    """Something beside a memory file that is not its own; the command line prints it as a note."""
+
+
 class UnknownIdError(List3rError):
     """An instance id that the memory has never held."""
 

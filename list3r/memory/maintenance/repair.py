@@ -15,6 +15,7 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
 from list3r.memory.records import Session
+from list3r.memory.store.beside import put_foreign_log_aside
 from list3r.memory.store.checksums import (
     OWN_CRC,
     SUMS_SINCE,
@@ -100,6 +101,7 @@ def repair(path: str | Path, out: str | Path | None = None) -> RepairReport:
 
 
 def _repair(path: Path, target: Path) -> RepairReport:
+    put_foreign_log_aside(path)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}-repair-", dir=target.resolve().parent) as folder:
         copy, made = Path(folder) / "damaged.l3r", Path(folder) / "sound.l3r"
         _copy(path, copy)

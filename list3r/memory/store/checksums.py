@@ -102,11 +102,13 @@ class BadRow:
 
 @cache
 def summed_tables(version: int = SCHEMA_VERSION) -> dict[str, SummedTable]:
-    """Every table of a schema by name, but `sums` and what is derived from the instances: the R*Tree and `words`."""
+    """Every table of a schema by name, but `sums`, `log_mark` and what is derived from the instances: the R*Tree and
+    `words`.
+    """
     with scratch_database(version) as database:
         names = database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'instance_boxes%' AND name != 'sums'"
-            " AND name != 'words' AND name NOT LIKE 'sqlite_%' ORDER BY name"
+            " AND name NOT IN ('words', 'log_mark') AND name NOT LIKE 'sqlite_%' ORDER BY name"
         ).fetchall()
         return {name: _table(name, database.execute(f"PRAGMA table_info({name})").fetchall()) for (name,) in names}
 

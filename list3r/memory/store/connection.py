@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any, Self, cast
 
 from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.store.beside import not_alone, opened_to_read, take_up_log
 from list3r.memory.store.checksums import PART_BITS, Sums, stored_seals
 from list3r.memory.store.committed import Committed
 from list3r.memory.store.file import (
@@ -25,13 +26,12 @@ from list3r.memory.store.file import (
     identified,
     migrate,
     migrated_copy,
-    not_alone,
-    reader,
     taken,
     use_write_ahead_log,
     write_empty,
 )
 from list3r.memory.store.lock import WriterLock
+from list3r.memory.store.log_mark import LogMark
 from list3r.memory.store.read_checks import FAILURES, WHOLE_BYTES, ReadChecks, any_text, unbelieved
 from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.word_index import WordIndex, up_to_date, write_words
@@ -65,7 +65,7 @@ class Connection:
         self._process = os.getpid()
         self._committed = None if lock is None else Committed(path)
         self._sums = None if lock is None else Sums(database)
-        self._followers = () if self._sums is None else (WordIndex(database), self._sums)
+        self._followers = () if self._sums is None else (WordIndex(database), self._sums, LogMark(database))
         """What follows the rows that a transaction changes; in this order as it commits."""
         self._checks = ReadChecks(database, self._committed, whole=_size(database) <= WHOLE_BYTES)
         self._writing = False
@@ -137,7 +137,7 @@ class Connection:
     def _open_to_read(cls, path: Path) -> Self:
         database: sqlite3.Connection | None = None
         try:
-            database = reader(path.resolve())
+            database = opened_to_read(path.resolve())
             if identified(path, database) < SCHEMA_VERSION:
                 with contextlib.closing(database) as older:
                     database = migrated_copy(path, older)
@@ -154,6 +154,7 @@ class Connection:
     def _connect(cls, path: Path, lock: WriterLock) -> Self:
         database: sqlite3.Connection | None = None
         try:
+            take_up_log(path.resolve())
             database = connected(path, "rw")
             version = identified(path, database)
             if version < SCHEMA_VERSION:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -34,8 +35,14 @@ class WriterLock:
         """
         self._path = lock_path(path)
         descriptor, ours = self._take(path)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps(_me()).encode(), 0)
+        try:
+            _write_holder(descriptor)
+        except OSError as error:
+            _let_go(descriptor, self._path, os.getpid(), ours)
+            raise MemoryFileError(
+                f"{path} cannot be written: {self._path.name}: {error.strerror}; free some space and run the command "
+                "again"
+            ) from error
         self._end = weakref.finalize(self, _let_go, descriptor, self._path, os.getpid(), ours)
 
     def _take(self, memory: Path) -> tuple[int, bool]:
@@ -89,6 +96,14 @@ class WriterLock:
 def lock_path(memory: Path) -> Path:
     """Where the lock of a memory lies while it is written."""
     return memory.with_name(f"{memory.name}-writer")
+
+
+def _write_holder(descriptor: int) -> None:
+    """Say in a lock who holds it. Raises `OSError` where that does not fit on the disk."""
+    text = json.dumps(_me()).encode()
+    os.ftruncate(descriptor, 0)
+    if os.pwrite(descriptor, text, 0) < len(text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _let_go(descriptor: int, path: Path, process: int, ours: bool) -> None:

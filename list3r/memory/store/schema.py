@@ -200,6 +200,10 @@ MIGRATIONS: tuple[str, ...] = (
         '$.T_world_graph', json('[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]'))
     WHERE key = 'library' AND json_valid(value);
     """,
+    # 12: which log is that of the file
+    """
+    CREATE TABLE log_mark (id INTEGER PRIMARY KEY, mark BLOB NOT NULL);
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)
