@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from incremental import HOP, SEEN, SPACING_M, STEP, again, begin, chunk, place_of, user_s
+from incremental import SEEN, SPACING_M, STEP, again, begin, chunk, place_of, user_s
 from machine import machine, write_json
 
 from list3r.memory.geometry import Sim3, rotation_exp
@@ -33,8 +33,6 @@ from list3r.memory.maintenance import edits
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.records import ChunkResult, Instance
 from list3r.memory.store.store import Store
-from list3r.pipeline import session as pipeline
-from list3r.pipeline.settings import AssociationSettings
 
 WALKS = {"walk": ("rooms", 300), "stay": ("stay", 200), "sessions": ("rooms", 15), "corridor": ("corridor", 1000)}
 """The way of each, and the chunks of a session."""
@@ -117,8 +115,7 @@ def add(store: Store, session: int, result: ChunkResult, seed: int) -> float:
         rows = store.chunks.all()
         moved = {c.chunk_id: placed(seed, c.chunk_id, len(rows)) for c in rows[-SOLVED:]}
         store.chunks.place(moved, dict.fromkeys(moved, rows[0].chunk_id))
-        due = session == 1 and pipeline._library_due(len(rows), AssociationSettings())
-        return timed(store, chunk_id) if due else 0.0
+        return timed(store, chunk_id) if session == 1 else 0.0
 
 
 def placed(seed: int, chunk_id: int, solved: int) -> Sim3:

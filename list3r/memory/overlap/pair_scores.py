@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,13 +33,12 @@ class PairScores:
     frame_iou: Array
     """Mean IoU of their boxes in those frames. Shape (E,)."""
 
-    def renumbered(self, first: Ints | None, second: Ints | None) -> PairScores:
-        """Return those of which both have a new position in their chunk, which is -1 for the others. None: as it is."""
-        i = self.i if first is None else first[self.i]
-        j = self.j if second is None else second[self.j]
-        kept = (i >= 0) & (j >= 0)
-        rest = (getattr(self, name)[kept] for name in ("i_on_j", "j_on_i", "shared", "frame_iou"))
-        return PairScores(i[kept], j[kept], *rest)
+    def only(self, kept: NDArray[np.bool_]) -> PairScores:
+        """Return some of them, (E,)."""
+        return PairScores(*(getattr(self, name)[kept] for name in _COLUMNS))
+
+
+_COLUMNS = ("i", "j", "i_on_j", "j_on_i", "shared", "frame_iou")
 
 
 def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3, grown: GrownCells | None = None) -> PairScores:
@@ -101,12 +100,6 @@ class Numbering:
     def __len__(self) -> int:
         return len(self.keys)
 
-    def flags(self, keys: Collection[Key]) -> NDArray[np.bool_]:
-        """Return which of them are among some local instances. Shape (N,)."""
-        out = np.zeros(len(self.keys), bool)
-        out[[self._at[k] for k in keys if k in self._at]] = True
-        return out
-
     def homes(self, groups: Iterable[Sequence[Key]]) -> Ints:
         """Return the number of the group that each is in, -1 for none. Shape (N,)."""
         out = np.full(len(self.keys), -1, np.int64)
@@ -127,6 +120,10 @@ class PairTable:
     """Share of a's surface that lies on b. Shape (M,)."""
     b_on_a: Array
     """Shape (M,)."""
+    shared: Ints
+    """Frames of the recording in which both are seen. Shape (M,)."""
+    frame_iou: Array
+    """Mean IoU of their boxes in those frames. Shape (M,)."""
 
     @staticmethod
     def of(pairs: Mapping[tuple[int, int], PairScores], numbering: Numbering) -> PairTable:
@@ -140,6 +137,8 @@ class PairTable:
             start_v + joined([p.j for _, _, p in known], np.int64),
             joined([p.i_on_j for _, _, p in known], np.float64),
             joined([p.j_on_i for _, _, p in known], np.float64),
+            joined([p.shared for _, _, p in known], np.int64),
+            joined([p.frame_iou for _, _, p in known], np.float64),
         )
 
 

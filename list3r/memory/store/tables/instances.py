@@ -20,7 +20,6 @@ from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.labels import DetectedLabels
-from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.relations import RelationTable
 
 Array = NDArray[np.float64]
@@ -122,13 +121,11 @@ class Instances:
         self,
         connection: Connection,
         ids: Ids,
-        library: LibraryState,
         of_instance: tuple[Embeddings, RelationTable, Events, DetectedLabels],
     ) -> None:
         """`of_instance` are the tables whose rows go with an instance."""
         self._connection = connection
         self._ids = ids
-        self._library = library
         self._embeddings, self._relations, self._events, self._labels = of_instance
         self._rows = Table(connection, "instances", _COLUMNS, "id", checked=True)
         self._ranked = _ranks([])
@@ -169,8 +166,6 @@ class Instances:
         self._rows.delete("id = ?", (instance_id,))
         self._connection.execute("DELETE FROM instance_boxes WHERE id = ?", (instance_id,))
         self._embeddings.drop(instance_id)
-        self._library.anchors.drop(instance_id)
-        self._library.looks.drop(instance_id)
         self._labels.drop(instance_id)
         self._relations.drop(instance_id)
         self._events.drop(instance_id, alias_of)
