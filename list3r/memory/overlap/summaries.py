@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +47,10 @@ class ChunkSummary:
     def digest(self) -> bytes:
         """What tells it apart from any other: overlaps are kept by it."""
         digest, shapes = hashlib.blake2b(digest_size=16), self.shapes
-        for part in (shapes.local_id, shapes.points, shapes.rgb, shapes.owner, shapes.occupied, shapes.truncated):
-            digest.update(np.ascontiguousarray(part).tobytes())
-        digest.update(b"".join(x.tobytes() for x in (*shapes.frames, *shapes.boxes_xyxy)))
+        measured = (shapes.local_id, shapes.points, shapes.rgb, shapes.owner, shapes.occupied, shapes.truncated)
+        parts: list[NDArray[Any]] = [*measured, *shapes.frames, *shapes.boxes_xyxy]
+        for part in parts:
+            digest.update(part.tobytes())
         digest.update(repr(sorted(self.motions)).encode())
         return digest.digest()
 
