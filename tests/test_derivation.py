@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from list3r.memory.geometry import Sim3
-from list3r.memory.library import attaching, relating
+from list3r.memory.library import attaching, consolidation, relating
 from list3r.memory.library.consolidation import ConsolidationReport, consolidate
 from list3r.memory.library.labels import apply_labels, put_votes
 from list3r.memory.library.rules import WORLD, ConsolidationSettings, RedundancySettings
@@ -168,9 +168,8 @@ def test_chunks_that_tremble_keep_their_overlaps(walks: ModuleType, store: Store
     boxes = {i.id: i.aabb for i in store.instances.all()}
     off = np.array([0.001, 0.0015, 0.0])
     with store.transaction():
-        store.chunks.place(
-            dict.fromkeys((1, 2, 3, 4), Sim3.exp(np.array([*off, 0, 0, 0, 0]))), dict.fromkeys((1, 2, 3, 4), 1)
-        )
+        there = Sim3.exp(np.array([*off, 0, 0, 0, 0]))
+        store.chunks.place(dict.fromkeys((1, 2, 3, 4), there), dict.fromkeys((1, 2, 3, 4), 1))
     end(store)
     assert store.connection.rows("SELECT * FROM pair_scores ORDER BY u, v") == kept
     for i in store.instances.all():
@@ -178,11 +177,8 @@ def test_chunks_that_tremble_keep_their_overlaps(walks: ModuleType, store: Store
     with store.transaction():
         store.chunks.place({2: Sim3.exp(np.array([0.02, 0, 0, 0, 0, 0, 0]))}, {2: 1})
     end(store)
-    turned = {(u, v) for u, v, stamp, _ in store.connection.rows("SELECT * FROM pair_scores")} & {
-        (u, v)
-        for u, v, stamp, _ in kept
-        if stamp not in {row[2] for row in store.connection.rows("SELECT * FROM pair_scores")}
-    }
+    now = {row[:2]: row[2] for row in store.connection.rows("SELECT * FROM pair_scores")}
+    turned = {(u, v) for u, v, stamp, _ in kept if now[u, v] != stamp}
     assert turned == {(u, v) for u, v, _, _ in kept if (u == 2) != (v == 2)}
 
 
@@ -223,10 +219,8 @@ def test_what_comes_between_is_attached_and_what_is_new_is_listed(walks: ModuleT
     for index in range(10):
         add(store, visit(walks, index, index))
     assert store.facts[WORLD].chunks == 10
-    before, rows = (
-        {i.id: i for i in store.instances.all()},
-        dict(store.connection.rows("SELECT id, geometry FROM instances")),
-    )
+    before, geometry = {i.id: i for i in store.instances.all()}, "SELECT id, geometry FROM instances"
+    rows = dict(store.connection.rows(geometry))
     seen = add(store, visit(walks, 10, 10))
     assert store.facts[WORLD].chunks == 10
     owners = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
@@ -234,8 +228,8 @@ def test_what_comes_between_is_attached_and_what_is_new_is_listed(walks: ModuleT
     again, fresh = set(of_new.values()) & before.keys(), set(of_new.values()) - before.keys()
     assert len(of_new) == 13 and len(again) >= 6 and len(fresh) >= 6
     assert {i.observations for i in store.instances.of(sorted(again))} != {before[n].observations for n in again}
-    now = dict(store.connection.rows("SELECT id, geometry FROM instances"))
-    assert all(now[n] == geometry for n, geometry in rows.items())
+    now = dict(store.connection.rows(geometry))
+    assert all(now[n] == there for n, there in rows.items())
     end(store)
     assert {n: o.instance_id for o in store.observations.all() if o.chunk_id == seen for n in [o.local_id]} == of_new
 
@@ -348,8 +342,6 @@ def test_what_redundant_chunks_saw_belongs_to_the_instances_that_are_derived_wit
 def test_redundant_chunks_follow_edits_and_moves(
     walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from list3r.memory.library import consolidation
-
     monkeypatch.setattr(consolidation, "settings_of", lambda store, settings: CULL)
     for index, place in enumerate([0, 1, 0, 1, 0, 1]):
         add(store, visit(walks, index, place, "corridor"))
