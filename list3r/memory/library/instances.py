@@ -184,9 +184,8 @@ def derive_instance(
 
 def _frames(members: Sequence[Member]) -> NDArray[np.int64]:
     """Return session id and index of the frames that show any of the members, in order. Shape (F, 2)."""
-    seen = [(m.shapes.session_id, np.asarray(m.shapes.frames[m.at], np.int64)) for m in members]
-    pairs = np.concatenate([np.column_stack([np.full(len(f), session), f]) for session, f in seen])
-    return np.unique(pairs, axis=0)
+    seen = np.unique(np.concatenate([m.shapes.session_id << 40 | m.shapes.frames[m.at] for m in members]))
+    return np.column_stack([seen >> 40, seen & (1 << 40) - 1])
 
 
 def _metre(members: Sequence[Member]) -> float:

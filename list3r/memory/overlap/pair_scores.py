@@ -64,25 +64,31 @@ def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
     if u.session_id != v.session_id or not shape[0] or not shape[1]:
         return count, total
     frames_u, frames_v = np.concatenate(u.frames), np.concatenate(v.frames)
-    common = np.intersect1d(frames_u, frames_v)
     boxes_u, boxes_v = np.concatenate(u.boxes_xyxy).astype(float), np.concatenate(v.boxes_xyxy).astype(float)
     owner_u = np.repeat(np.arange(shape[0]), [len(f) for f in u.frames])
+    order = np.argsort(frames_v, kind="stable")
+    first = np.searchsorted(frames_v[order], frames_u)
+    times = np.searchsorted(frames_v[order], frames_u, side="right") - first
+    at_u = np.repeat(np.arange(len(frames_u)), times)
+    at_v = order[np.arange(len(at_u)) + np.repeat(first - (np.cumsum(times) - times), times)]
     owner_v = np.repeat(np.arange(shape[1]), [len(f) for f in v.frames])
-    for frame in common:
-        at_u, at_v = np.flatnonzero(frames_u == frame), np.flatnonzero(frames_v == frame)
-        cell = np.ix_(owner_u[at_u], owner_v[at_v])
-        count[cell] += 1
-        total[cell] += box_iou(boxes_u[at_u], boxes_v[at_v])
+    cell = owner_u[at_u] * shape[1] + owner_v[at_v]
+    count = np.bincount(cell, minlength=count.size).reshape(shape)
+    total = np.bincount(cell, _iou(boxes_u[at_u], boxes_v[at_v]), minlength=total.size).reshape(shape)
     return count * min(u.stands_for, v.stands_for), total / np.maximum(count, 1)
 
 
 def box_iou(a: Array, b: Array) -> Array:
     """Return IoU of boxes xyxy. Shape (A, 4), (B, 4) -> (A, B)."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    inter = np.prod(np.clip(high - low, 0, None), axis=2)
-    area_a, area_b = np.prod(a[:, 2:] - a[:, :2], axis=1), np.prod(b[:, 2:] - b[:, :2], axis=1)
-    return np.asarray(inter / np.maximum(area_a[:, None] + area_b[None] - inter, 1e-9))
+    return _iou(a[:, None], b[None])
+
+
+def _iou(a: Array, b: Array) -> Array:
+    """Return IoU of pairs of boxes xyxy. Shapes (..., 4) broadcast."""
+    low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
+    inter = np.prod(np.clip(high - low, 0, None), axis=-1)
+    area_a, area_b = (np.prod(x[..., 2:] - x[..., :2], axis=-1) for x in (a, b))
+    return np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9))
 
 
 class Numbering:

@@ -95,7 +95,7 @@ class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None], ChunkSummary]
 
 
 class SampledCache(LruCache[tuple[int, int], SampledChunk]):
-    """By chunk id and checksum of what the chunk measured: of up to 64 chunks planes are asked for with every new one."""
+    """By chunk id and checksum of what the chunk measured: up to 64 chunks are asked for theirs with every new one."""
 
     def __init__(self) -> None:
         super().__init__(_SAMPLED * 2)
