@@ -74,7 +74,7 @@ def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
     owner_v = np.repeat(np.arange(shape[1]), [len(f) for f in v.frames])
     cell = owner_u[at_u] * shape[1] + owner_v[at_v]
     count = np.bincount(cell, minlength=count.size).reshape(shape)
-    total = np.bincount(cell, _iou(boxes_u[at_u], boxes_v[at_v]), minlength=total.size).reshape(shape)
+    total += np.bincount(cell, _iou(boxes_u[at_u], boxes_v[at_v]), minlength=total.size).reshape(shape)
     return count * min(u.stands_for, v.stands_for), total / np.maximum(count, 1)
 
 

@@ -305,7 +305,7 @@ def _reached(target: ChunkShapes) -> tuple[Array, Array]:
 
 
 _KEPT_BYTES = 128 << 20
-"""Those of some 280 chunks with a dozen things: of a place that many sessions saw, all are asked for again and again."""
+"""Those of some 280 chunks with a dozen things: of a place that many sessions saw, all are asked for in turn."""
 
 
 @dataclass(frozen=True)
