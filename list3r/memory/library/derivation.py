@@ -104,6 +104,7 @@ class Formed:
 
 def form(scene: Scene, *, ended: bool) -> Formed:
     """Group the local instances, find what sessions have changed, and weigh what came of that."""
+    scene.scores.prepare(scene.pairs(scene.rows.keys()), every=True)
     redundant = find_redundant(scene)
     overlaps = scene.overlaps(scene.pairs(scene.rows.keys() - redundant.whole), redundant.like)
     places = group(scene, overlaps, redundant.like)

@@ -7,7 +7,7 @@ not depend on when they were computed, and a chunk that trembles keeps them.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from list3r.memory.change.detection import ChangeSettings, across_sessions
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Array, Sim3, rotation_exp, rotation_log
+from list3r.memory.geometry import Sim3, rotation_exp, rotation_log, stack, take
 from list3r.memory.merging.movers import without_moving
 from list3r.memory.overlap.pair_scores import PairScores, pair_scores
 from list3r.memory.overlap.summaries import Summaries
 from list3r.memory.overlap.voxels import GrownCells
-from list3r.memory.records import ChunkRow
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.pair_scores import StoredScores
 
@@ -53,16 +52,45 @@ class PairScoreCache:
         self._rounding, self._changes, _ = settings
         self._settings = repr(settings).encode()
         self._carving = FreeSpaceCarving(store, self._changes.visibility)
+        self._rounded: dict[Pair, tuple[Sim3, bytes]] = {}
+        self._kept: dict[Pair, StoredScores] = {}
         self._known: dict[Pair, PairScores] = {}
         self._fresh: dict[Pair, StoredScores] = {}
+
+    def prepare(self, pairs: Sequence[Pair], *, every: bool = False) -> None:
+        """Round the poses of pairs of chunks, u <= v, and read what is kept of them; with `every`, of all there are."""
+        rounded, chunks, s = self._rounded, self._store.chunks, self._rounding
+        missing = [p for p in pairs if p not in rounded]
+        if not missing:
+            return
+        known = {
+            k: (self._summaries[k].unit, self._summaries[k].digest) for k in sorted({k for p in missing for k in p})
+        }
+        u, v = (stack([chunks.get(p[n]).S_world_chunk for p in missing]) for n in (0, 1))
+        S_u_v = u.inverse() @ v
+        unit = np.array([known[k][0] for k, _ in missing])
+        steps = np.column_stack([*[s.move_m * unit] * 3, *[np.full(len(unit), np.radians(s.turn_deg))] * 3])
+        steps = np.column_stack([steps, np.full(len(unit), s.scale)])
+        exact = np.column_stack([S_u_v.translation, rotation_log(S_u_v.rotation), np.log(S_u_v.scale)])
+        exact[[k == m for k, m in missing]] = 0.0
+        place = np.rint(exact / steps).astype(np.int64)
+        near = place * steps
+        poses = Sim3(np.exp(near[:, 6]), rotation_exp(near[:, 3:6]), near[:, :3])
+        for n, p in enumerate(missing):
+            digests = (known[k][1] for k in p)
+            parts = (*digests, place[n].tobytes(), steps[n].tobytes(), self._settings)
+            rounded[p] = take(poses, n), hashlib.blake2b(b"".join(parts), digest_size=16).digest()
+        table = self._store.pair_scores
+        rows = table.all() if every else [row for p in missing if (row := table.get(*p)) is not None]
+        self._kept |= {(row.u, row.v): row for row in rows}
 
     def of(self, u: int, v: int) -> PairScores:
         """Return how two chunks overlap, u <= v, without what moves, and without what plainly is two instances of two
         sessions at one place.
         """
         if (u, v) not in self._known:
-            rounded, stamp = self._rounded(self._store.chunks.get(u), self._store.chunks.get(v))
-            kept = self._store.pair_scores.get(u, v)
+            self.prepare([(u, v)])
+            (rounded, stamp), kept = self._rounded[u, v], self._kept.get((u, v))
             if kept is None or kept.stamp != stamp:
                 found = self._computed(u, v, rounded)
                 self._fresh[u, v] = StoredScores(u, v, stamp, pack_scores(found))
@@ -78,21 +106,6 @@ class PairScoreCache:
         self._fresh.clear()
         if near is not None:
             table.drop(p for p in table.pairs() if p not in near)
-
-    def _rounded(self, u: ChunkRow, v: ChunkRow) -> tuple[Sim3, bytes]:
-        """Return S_u_v rounded to the tolerance, and what tells apart all that the overlap depends on."""
-        S_u_v, s = u.S_world_chunk.inverse() @ v.S_world_chunk, self._rounding
-        digests = [self._summaries[c.chunk_id].digest for c in (u, v)]
-        steps = np.array([s.move_m * self._summaries[u.chunk_id].unit, np.radians(s.turn_deg), s.scale])
-        place = np.zeros(7, np.int64)
-        if u.chunk_id != v.chunk_id:
-            place[:3] = np.rint(S_u_v.translation / steps[0])
-            place[3:6] = np.rint(rotation_log(S_u_v.rotation) / steps[1])
-            place[6] = np.rint(np.log(float(S_u_v.scale)) / steps[2])
-        parts = (*digests, place.tobytes(), steps.tobytes(), self._settings)
-        stamp = hashlib.blake2b(b"".join(parts), digest_size=16).digest()
-        scale: Array = np.exp(place[6] * steps[2])
-        return Sim3(scale, rotation_exp(place[3:6] * steps[1]), place[:3] * steps[0]), stamp
 
     def _computed(self, u: int, v: int, S_u_v: Sim3) -> PairScores:
         summaries = {k: self._summaries[k] for k in (u, v)}

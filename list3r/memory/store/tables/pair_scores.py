@@ -35,6 +35,10 @@ class PairScoreTable:
         """Return how two chunks overlap, if that was kept."""
         return self._rows.first("u = ? AND v = ?", (u, v))
 
+    def all(self) -> list[StoredScores]:
+        """Return how all pairs overlap that are kept."""
+        return self._rows.all()
+
     def pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of chunks that are kept, in order."""
         return [(u, v) for u, v in self._connection.rows("SELECT u, v FROM pair_scores ORDER BY u, v")]
