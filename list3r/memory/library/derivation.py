@@ -57,8 +57,6 @@ class Library:
     decisions: Sequence[MergeDecision]
     hidden: int
     """Groups that are not shown."""
-    near: frozenset[Pair]
-    """Pairs of chunks that lie near each other and take part."""
 
 
 def derive(scene: Scene, known: Known, *, ended: bool) -> Library:
@@ -80,7 +78,6 @@ def derive(scene: Scene, known: Known, *, ended: bool) -> Library:
         of_first={g[0]: n for n, g in members.items()},
         decisions=[*formed.places.decisions, *changes.decisions],
         hidden=len(weighed) - len(members),
-        near=frozenset(formed.overlaps),
     )
 
 

@@ -7,7 +7,7 @@ not depend on when they were computed, and a chunk that trembles keeps them.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,13 +99,15 @@ class PairScoreCache:
             self._known[u, v] = found
         return self._known[u, v]
 
-    def write(self, near: Collection[Pair] | None = None) -> None:
-        """Keep what was computed; `near` are all pairs that are still of use. Call inside `transaction()`."""
+    def write(self, *, every: bool = False) -> None:
+        """Keep what was computed; where `every` pair that matters was asked for, the others are forgotten. Call inside
+        `transaction()`.
+        """
         table = self._store.pair_scores
         table.put(self._fresh[p] for p in sorted(self._fresh))
         self._fresh.clear()
-        if near is not None:
-            table.drop(p for p in table.pairs() if p not in near)
+        if every:
+            table.drop(p for p in table.pairs() if p not in self._known)
 
     def _computed(self, u: int, v: int, S_u_v: Sim3) -> PairScores:
         summaries = {k: self._summaries[k] for k in (u, v)}

@@ -26,7 +26,7 @@ def read_known(store: Store) -> Known:
 def write_library(scene: Scene, library: Library, known: Known, chunk_id: int) -> None:
     """Bring a memory up to a library; `chunk_id` names the entries of the merge log. Call inside `transaction()`."""
     store = scene.store
-    scene.scores.write(library.near)
+    scene.scores.write(every=True)
     for n in sorted(known.labels.keys() - library.instances.keys()):
         store.instances.drop(n, dict(library.ids.aliases).get(n))
     _write_instances(store, library, scene.world.space)
