@@ -330,7 +330,7 @@ def test_what_redundant_chunks_saw_belongs_to_the_instances_that_are_derived_wit
                 add(one, visit(walks, index, place, "corridor"), settings=settings)
             end(one, settings)
         assert [k for k in range(1, 11) if (k, k) in store.pair_scores.pairs()] == [1, 2, 3, 4, 9]
-        assert len(store.pair_scores.pairs()) < 0.6 * len(every.pair_scores.pairs())
+        assert len(store.pair_scores.pairs()) < len(every.pair_scores.pairs())
         things, others = store.instances.all(structure=False), every.instances.all(structure=False)
         for a, b in zip(things, others, strict=True):
             assert store.observations.of(a.id) == every.observations.of(b.id)
