@@ -80,7 +80,6 @@ def relate(scene: Scene, instances: Iterable[DerivedInstance]) -> list[Relation]
     order = sorted(known.of.values(), key=lambda b: (*np.floor(b.aabb.mean(axis=0) / (_PLACE_M * unit)), b.id))
     reach = (np.array([_REACH_M, _REACH_M, max(_REACH_M, s.above_m)]) + _SLACK_M) * unit
     out, measured = dict[tuple[int, str, int], Relation](), PairMeasures()
-    measured.begin(unit, s)
     for first in range(0, len(order), _TOGETHER):
         subjects = {b.id for b in order[first : first + _TOGETHER]}
         there = _within_rings(known, subjects, reach)
