@@ -45,6 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--walks", default=",".join(WALKS), help="some of " + ", ".join(WALKS))
     parser.add_argument("--chunks", type=int, help="chunks of a session, instead of its own number")
+    parser.add_argument("--at-end", action="store_true", help="derive the library when sessions end alone")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--against", type=Path)
@@ -54,7 +55,7 @@ def main() -> None:
     found: dict[str, Any] = {}
     for name in words.walks.split(","):
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            row, listed = pool.submit(measure, name, words.chunks or WALKS[name][1], words.seed).result()
+            row, listed = pool.submit(measure, name, words).result()
         if words.keep:
             words.keep.mkdir(parents=True, exist_ok=True)
             (words.keep / f"{name}.json").write_text(json.dumps(listed))
@@ -65,16 +66,17 @@ def main() -> None:
         write_json(words.json, {"walks": found})
 
 
-def measure(name: str, chunks: int, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def measure(name: str, words: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
     """Build one memory; what it cost, and what it lists."""
-    spent: list[float] = []
+    spent, chunks, seed = list[float](), words.chunks or WALKS[name][1], words.seed
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "walk.l3r") as store:
         for session in range(1, (SESSIONS if name == "sessions" else 1) + 1):
             begin(store, chunks)
             with store.transaction():
                 store.facts.gravity = "known"
             for k in range(chunks):
-                spent.append(add(store, session, made(name, session, k, seed), seed))
+                derived = session == 1 and not words.at_end
+                spent.append(add(store, session, made(name, session, k, seed), seed, derived=derived))
             end_s = ended(store, session, name, seed)
         with store.transaction():
             again_s = timed(store)
@@ -108,14 +110,14 @@ def made(name: str, session: int, k: int, seed: int) -> ChunkResult:
     return chunk(k, way, seed) if session == 1 else again(0, k, way, seed, session)
 
 
-def add(store: Store, session: int, result: ChunkResult, seed: int) -> float:
-    """Add a chunk as a build does, and derive the library as often; processor seconds of that."""
+def add(store: Store, session: int, result: ChunkResult, seed: int, *, derived: bool) -> float:
+    """Add a chunk as a build does, and bring the library up to it; processor seconds of that."""
     with store.transaction():
         chunk_id = store.chunks.add(session, result)
         rows = store.chunks.all()
         moved = {c.chunk_id: placed(seed, c.chunk_id, len(rows)) for c in rows[-SOLVED:]}
         store.chunks.place(moved, dict.fromkeys(moved, rows[0].chunk_id))
-        return timed(store, chunk_id) if session == 1 else 0.0
+        return timed(store, chunk_id) if derived else 0.0
 
 
 def placed(seed: int, chunk_id: int, solved: int) -> Sim3:
