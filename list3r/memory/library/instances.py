@@ -85,8 +85,6 @@ class DerivedInstance:
     frames: NDArray[np.int64]
     """Session id and Frame.index of every frame in which it is seen, in order. Shape (F, 2)."""
     best_view: BestView | None
-    anchor: int
-    """Id of the chunk that saw it longest."""
     shape: str
     """Its shape in a word, see `memory.describe`."""
     swatches: tuple[Swatch, ...]
@@ -130,7 +128,6 @@ def derived_instance(instance_id: int, members: Members, settings: DeriveSetting
         found,
         geometry=now.geometry,
         box=now.box,
-        anchor=now.anchor,
         shape=now.shape,
         dynamic=True,
         resting=m.mover.resting,
@@ -174,12 +171,11 @@ def derive_instance(
         flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
         component=component,
     )
-    anchor = members[int(np.argmax(counts))].shapes.chunk_id
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(geometry, told, unit_feature, frames, view, anchor, shape, colors)
+    return DerivedInstance(geometry, told, unit_feature, frames, view, shape, colors)
 
 
 def _frames(members: Sequence[Member]) -> NDArray[np.int64]:

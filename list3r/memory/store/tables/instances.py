@@ -152,15 +152,6 @@ class Instances:
         self._rows.put(records)
         self._put_boxes((i.id, i.aabb) for i in records)
 
-    def set_places(self, instances: Iterable[Instance]) -> None:
-        """Write where instances that are there lie, and how surely: all that moving them changes."""
-        records = list(instances)
-        self._connection.execute_many(
-            "UPDATE instances SET geometry = ?, position_sigma_m = ? WHERE id = ?",
-            [(*_pack_geometry(i.center, i.aabb, i.box), i.position_sigma_m, i.id) for i in records],
-        )
-        self._put_boxes((i.id, i.aabb) for i in records)
-
     def drop(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
         self._rows.delete("id = ?", (instance_id,))
@@ -186,16 +177,6 @@ class Instances:
             self._ranked = self._ranked.with_more(_ranks(list(rows)))
         held = wanted[_is_in(wanted, self._ranked.ids)]
         return self._ranked.among(np.searchsorted(self._ranked.ids, held))
-
-    def states(self) -> dict[int, tuple[str, int]]:
-        """Return state and component of every instance, by id."""
-        rows = self._connection.rows("SELECT id, state, component FROM instances")
-        return {n: (state, component) for n, state, component in rows}
-
-    def set_states(self, states: Mapping[int, str]) -> None:
-        """Write the state of instances, by id."""
-        statement = "UPDATE instances SET state = ? WHERE id = ?"
-        self._connection.execute_many(statement, [(state, n) for n, state in sorted(states.items())])
 
     def set_labels(self, labels: Mapping[int, str | None]) -> None:
         """Name instances, by id; None takes a name away."""
