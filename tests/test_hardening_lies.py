@@ -7,7 +7,6 @@ import resource
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -88,7 +87,7 @@ SOME = {
     "placements 1: S_world_chunk": "UPDATE placements SET S_world_chunk = zeroblob(104)",
     "frames 1:3: T_chunk_cam": "UPDATE frames SET T_chunk_cam = zeroblob(128) WHERE frame_index = 3",
     "relations: object 77 is not in instances": "UPDATE relations SET object = 77 WHERE subject = 3",
-    "overlaps 2:2: scores": "UPDATE overlaps SET scores = scores || x'00' WHERE u = 2 AND v = 2",
+    "pair_scores 2:2: scores": "UPDATE pair_scores SET scores = scores || x'00' WHERE u = 2 AND v = 2",
     "bends 2: twists": "UPDATE bends SET twists = CAST(x'000000000000f87f' || zeroblob(length(twists) - 8) AS BLOB)",
     "bends 2: frames": "UPDATE bends SET frames = CAST(x'000000000000f07f' || zeroblob(length(frames) - 8) AS BLOB)",
     "aliases": "UPDATE aliases SET instance = id",
@@ -116,7 +115,7 @@ def test_a_lie_is_one_line_that_names_table_and_row(
         assert store.facts.gravity
         store.edges.all()
         store.local_instances.nodes()
-        store.library.overlaps.all([2])
+        store.pair_scores.get(2, 2)
         store.bends.all()
 
 
@@ -135,32 +134,14 @@ def test_an_edit_refuses_overlaps_of_local_instances_that_are_gone(
 def test_a_lie_about_what_is_not_listed_is_one_line(
     hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with Store.open(rich, writable=True) as store, store.transaction():
-        held = store.library.members.of([c.chunk_id for c in store.chunks.all()])
-        hidden = held[max(held)].first
-        store.library.members.put([replace(m, shown=False) for m in held.values() if m.first == hidden])
     assert run(["list", str(rich), "--min-confidence", "0"]) == 0
     with sqlite3.connect(rich) as database:
-        database.execute("UPDATE overlaps SET v = '' WHERE u = 1 AND v = 2")
+        database.execute("UPDATE pair_scores SET scores = zeroblob(8) WHERE u = 1 AND v = 2")
         hostile.lies.sign(database)
     capsys.readouterr()
     assert run(["list", str(rich), "--min-confidence", "0"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ") and said.count("\n") == 1
-
-
-def test_an_edit_refuses_overlaps_of_a_chunk_that_is_redundant(
-    hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with sqlite3.connect(rich) as database:
-        database.execute("DELETE FROM members")
-        hostile.lies.sign(database)
-    assert run(["merge", str(rich), "2", "5"]) == 2
-    assert "chunk 2" in capsys.readouterr().err
-    assert run(["verify", str(rich)]) == 1
-    assert "overlaps: chunk 2 is redundant" in capsys.readouterr().out
-    repair(rich)
-    assert run(["merge", str(rich), "2", "5"]) == 0
 
 
 def test_a_label_that_is_no_text_is_mended(hostile: SimpleNamespace, rich: Path) -> None:

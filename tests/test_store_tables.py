@@ -11,15 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from list3r.memory.change.ledger import read_ledger
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
-from list3r.memory.library.rules import WORLD
 from list3r.memory.records import DetectedLabel, SessionCamera, Votes
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.rows.json_values import array_scalar, typed
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.library import Anchor
 
 Make = Callable[..., Path]
 CUP = Votes(0.5, {"cup": (4.0, 16.0)}, 4.0)
@@ -35,17 +31,12 @@ def test_what_schema_7_kept_as_key_and_value_is_in_columns(tmp_path: Path) -> No
         assert second.lost_reasons == ("too few matches",)
         assert store.votes.of(1) == store.votes.of(2) == {"old-net": {0: CUP}}
         assert store.detected_labels.all() == {1: DetectedLabel("cup", 0.9566, 8.0, "old-net")}
-        world, ledger = store.facts[WORLD], read_ledger(store, store.chunks.all())
-        assert world is not None and (world.light.white_l, world.posed) == (96.0, 14)
-        assert ledger is not None and ledger.with_events == {(1, 0), (1, 1)}
         keys = {key for (key,) in store.connection.rows("SELECT key FROM memory")}
         assert keys <= {
-            "change_ledger",
             "created_by",
             "gravity",
             "label classes",
             "last_id",
-            "library",
             "poses",
             "scale_source",
         }
@@ -84,18 +75,6 @@ def test_the_label_of_a_detector_goes_with_its_instance(make_memory: Make) -> No
             store.instances.drop(4, None)
         assert store.detected_labels.all() == {3: replace(label, label="mug")}
         assert store.verify() == []
-
-
-def test_all_anchors_come_once_and_in_order_though_they_are_written_meanwhile(tmp_path: Path) -> None:
-    with Store.create(tmp_path / "m.l3r") as store:
-        with store.transaction():
-            store.library.anchors.put({n: Anchor(n % 7, Sim3.identity()) for n in range(2500, 0, -1)})
-            told = []
-            for some in store.library.anchors.all():
-                told.append(list(some))
-                store.library.anchors.put({n: Anchor(a.chunk_id + 1, a.S_exact_settled) for n, a in some.items()})
-        assert len(told) == 3 and [n for some in told for n in some] == list(range(1, 2501))
-        assert all(a.chunk_id == n % 7 + 1 for some in store.library.anchors.all() for n, a in some.items())
 
 
 def test_a_fact_is_what_was_written_last_and_none_forgets_it(make_memory: Make) -> None:

@@ -55,10 +55,10 @@ def add_chunk(
         chunk_id = store.chunks.add(session_id, result)
         named = {i.local_id: votes_of_names(i.names) for i in result.library.instances if i.names}
         if named:
-            put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named, fresh=True)
+            put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named)
         probable = {i.local_id: votes_of_probabilities(i.named) for i in result.library.instances if i.named}
         if probable:
-            put_votes(store, chunk_id, OWN_NAMES, probable, fresh=True)
+            put_votes(store, chunk_id, OWN_NAMES, probable)
         if result.posed.any():
             _relate(store, session_id, chunk_id, result, joint, chosen, debug_dir)
         place_chunks(store, chosen, chunk_id)

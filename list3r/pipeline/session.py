@@ -227,8 +227,7 @@ def add_chunks(
         joint = joint_windows(store, session, first, pool)
         for task, results in zip(plan.tasks(), pool.map(plan.tasks()), strict=True):
             for part in (p for p in results if p.index not in known):
-                due = not later and _library_due(len(store.chunks.all()) + 1, how)
-                add_chunk(store, session, part, joint, how, library=due, debug_dir=watch.debug_dir)
+                add_chunk(store, session, part, joint, how, library=not later, debug_dir=watch.debug_dir)
                 note_lost(store, session, part)
                 added(part)
             watch.show(task.span.stop, count)
@@ -255,11 +254,6 @@ def chunk_pool(job: Job) -> ChunkPool:
     camera_first = is_camera_wanted(job.info, job.options, settings)
     pool.start(get_ready_for_camera if camera_first else get_ready, settings)
     return pool
-
-
-def _library_due(chunks: int, how: AssociationSettings) -> bool:
-    """Return whether the library is derived with the last of so many chunks: the same after a kill as without."""
-    return chunks <= how.library_always or chunks % how.library_every == 0
 
 
 MOST_DEPTH_EVERY = 8

@@ -46,8 +46,8 @@ from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
 """Tables that consolidation writes; a row lost there is written again."""
-_PASSING = ("settled", "overlaps", "members", "anchors", "redundant", "looks")
-"""Tables that consolidation goes on with; without them it derives the library as a whole."""
+_PASSING = ("pair_scores",)
+"""Tables of what can be computed again."""
 _OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""

@@ -41,9 +41,10 @@ _PARTS = 500
 """Parts of the sums that are asked for in one statement."""
 BOXES = "instance_boxes"
 WORDS = "words"
-_OF_INSTANCES = {
-    name: name for name in ("instances", "relations", "observations", "embeddings", "overlaps", "members", "redundant")
-} | {BOXES: "instances", WORDS: "instances"}
+_OF_INSTANCES = {name: name for name in ("instances", "relations", "observations", "embeddings", "pair_scores")} | {
+    BOXES: "instances",
+    WORDS: "instances",
+}
 """Tables that grow with what there is to see and are read in part, and the table whose rows tell how large they are."""
 
 

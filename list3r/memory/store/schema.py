@@ -204,6 +204,15 @@ MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE log_mark (id INTEGER PRIMARY KEY, mark BLOB NOT NULL);
     """,
+    # 13: the library is derived whole; of what it goes on with only the overlaps of pairs of chunks are kept
+    """
+    DROP TABLE settled; DROP TABLE overlaps; DROP TABLE members; DROP TABLE anchors; DROP TABLE redundant;
+    DROP TABLE looks;
+    CREATE TABLE pair_scores (
+        u INTEGER NOT NULL REFERENCES chunks, v INTEGER NOT NULL REFERENCES chunks, stamp BLOB NOT NULL,
+        scores BLOB NOT NULL, PRIMARY KEY (u, v)) WITHOUT ROWID;
+    DELETE FROM memory WHERE key IN ('library', 'change_ledger');
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

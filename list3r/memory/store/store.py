@@ -25,9 +25,9 @@ from list3r.memory.store.tables.frames import Frames, Keyframes
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.instances import Instances
 from list3r.memory.store.tables.labels import DetectedLabels, LabelVotes
-from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.local_instances import LocalInstances, Supports
 from list3r.memory.store.tables.observations import Observations
+from list3r.memory.store.tables.pair_scores import PairScoreTable
 from list3r.memory.store.tables.relations import RelationTable
 from list3r.memory.store.tables.sessions import Sessions
 from list3r.memory.store.tables.words import Words
@@ -50,13 +50,12 @@ class Store:
 
     def _add_measured(self, connection: Connection) -> None:
         """What chunks measured, and where they lie."""
-        self.library = LibraryState(connection)
         self.sessions = Sessions(connection)
         self.frames = Frames(connection)
         self.keyframes = Keyframes(connection)
         self.supports = Supports(connection)
-        self.local_instances = LocalInstances(connection, self.supports, self.library)
-        self.chunks = Chunks(connection, self.frames, self.keyframes, self.local_instances, self.library)
+        self.local_instances = LocalInstances(connection, self.supports)
+        self.chunks = Chunks(connection, self.frames, self.keyframes, self.local_instances)
         self.edges = Edges(connection)
         self.bends = Bends(connection)
         self.votes = LabelVotes(connection)
@@ -64,6 +63,7 @@ class Store:
 
     def _add_library(self, connection: Connection) -> None:
         """What is derived from that, and what operators said of it."""
+        self.pair_scores = PairScoreTable(connection)
         self.merges = MergeLog(connection)
         self.edits = Edits(connection)
         self.ids = Ids(connection, self.facts, self.edits)
@@ -72,7 +72,7 @@ class Store:
         self.events = Events(connection)
         self.detected_labels = DetectedLabels(connection)
         of_instance = self.embeddings, self.relations, self.events, self.detected_labels
-        self.instances = Instances(connection, self.ids, self.library, of_instance)
+        self.instances = Instances(connection, self.ids, of_instance)
         self.observations = Observations(connection, self.ids)
         self.words = Words(connection)
         self.surfaces = Surfaces(self.chunks, self.supports, self.instances, self.events)

@@ -234,34 +234,7 @@ RULES: Mapping[str, Mapping[str, Rule]] = {
         "S_world_chunk": _SIM3,
         "covariance": _maybe(_checked("list3r_covariance", "7x7 finite numbers")),
     },
-    "settled": {
-        "chunk_id": _CHUNK,
-        "component": _integer(0),
-        "S_graph_chunk": _SIM3,
-        "extent": Rule("typeof({}) = 'blob' AND length({}) = 48", "a box"),
-        "dropped": Rule("typeof({}) = 'blob'", "bits"),
-        "carried": Rule("typeof({}) = 'blob' AND length({}) = 32", "four numbers"),
-    },
-    "overlaps": {"scores": _bytes(36, "six numbers a pair")},
-    "members": {"first_chunk": _CHUNK, "first_local": _LOCAL, "shown": _FLAG},
-    "anchors": {"instance": _integer(1), "chunk_id": _CHUNK, "S_exact_settled": _SIM3},
-    "redundant": {
-        "chunk_id": _CHUNK,
-        "local_id": _LOCAL,
-        "like_chunk": _CHUNK,
-        "like_local": _LOCAL,
-        "frames": _bytes(4, "numbers"),
-    },
-    "looks": {
-        "instance": _integer(1),
-        "shape": _text(60),
-        "resting": _FLAG,
-        "swatches": Rule(
-            f"typeof({{}}) = 'blob' AND length({{}}) BETWEEN 56 AND {_MOST_CELL} AND length({{}}) % 56 = 0"
-            " AND list3r_colors({})",
-            "seven finite numbers a colour",
-        ),
-    },
+    "pair_scores": {"stamp": _bytes(16, "a digest"), "scores": _bytes(36, "six numbers a pair")},
     "bends": {
         "chunk_id": _CHUNK,
         "frames": _checked("list3r_places", "finite numbers"),
@@ -306,9 +279,8 @@ REFERENCES = (
     ("supports", "chunk_id", "chunks", "chunk_id"),
     ("observations", "chunk_id, local_id", "local_instances", "chunk_id, local_id"),
     ("supports", "chunk_id, local_id", "local_instances", "chunk_id, local_id"),
-    ("anchors", "instance", "instances", "id"),
-    ("looks", "instance", "instances", "id"),
-    ("redundant", "chunk_id", "chunks", "chunk_id"),
+    ("pair_scores", "u", "chunks", "chunk_id"),
+    ("pair_scores", "v", "chunks", "chunk_id"),
     ("votes", "chunk_id", "chunks", "chunk_id"),
     ("detected_labels", "instance", "instances", "id"),
     ("events", "instance", "instances", "id"),
@@ -348,11 +320,6 @@ def bad_references(database: sqlite3.Connection, name: str) -> Iterator[str]:
             f"SELECT chunk_id, frame_index FROM keyframes k WHERE NOT EXISTS ({inside} AND frame_index <= last_frame)"
         )
         yield from (f"keyframes {u}:{n}: it is not a frame of its chunk" for u, n in database.execute(query))
-    if name == "overlaps":
-        chunks = "SELECT u AS chunk_id FROM overlaps UNION SELECT v FROM overlaps"
-        alone = "SELECT chunk_id FROM redundant EXCEPT SELECT chunk_id FROM members"
-        for (chunk_id,) in database.execute(f"{chunks} INTERSECT SELECT * FROM ({alone})"):
-            yield f"overlaps: chunk {chunk_id} is redundant and has none"
     if name == "aliases":
         yield from _circles(dict(database.execute("SELECT id, instance FROM aliases").fetchall()))
 
@@ -432,10 +399,6 @@ def _floats(blob: bytes, count: int, most: float) -> Any:
 
 def _is_rotation(matrix: Any) -> bool:
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3 and np.linalg.det(matrix) > 0)
-
-
-def _are_colors(blob: bytes) -> bool:
-    return len(_floats(blob, len(blob) // 8, 256.0)) > 0
 
 
 def _is_sim3(blob: bytes) -> bool:
@@ -535,5 +498,4 @@ _FUNCTIONS: Mapping[str, Callable[..., bool]] = {
     "list3r_box": _is_box,
     "list3r_vector": _is_vector,
     "list3r_value": _is_value,
-    "list3r_colors": _are_colors,
 }

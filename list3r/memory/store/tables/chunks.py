@@ -16,7 +16,6 @@ from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns, arrays, joined
 from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.frames import Frames, Keyframes
-from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.local_instances import LocalInstances
 
 _INTRINSICS = joined(("fx", "fy", "cx", "cy"), ("intrinsics",), tuple, lambda *px: (px,))
@@ -74,13 +73,11 @@ class Chunks:
         frames: Frames,
         keyframes: Keyframes,
         local_instances: LocalInstances,
-        library: LibraryState,
     ) -> None:
         self._connection = connection
         self._frames = frames
         self._keyframes = keyframes
         self._local_instances = local_instances
-        self._library = library
         measured = Columns.of(_Measured, _INTRINSICS, _IMAGE_SIZE, _SAMPLES, index="chunk_index")
         self._measured = Table(connection, "chunks", measured, "chunk_id")
         self._placements = Table(connection, "placements", Columns.of(_Placement), "chunk_id")
@@ -117,7 +114,6 @@ class Chunks:
         self._placements.put([_Placement(chunk_id, chunk_id, Sim3.identity(), None)])
         if self._known is not None:
             self._known = {**self._known, **{c.chunk_id: c for c in self._placed.all("chunk_id = ?", (chunk_id,))}}
-        self._library.touch([chunk_id])
         self._frames.add(session_id, chunk_id, result)
         self._keyframes.add(chunk_id, result.keyframes)
         for instance in result.library.instances:
@@ -161,7 +157,6 @@ class Chunks:
                 rows[k] = after
         self._placements.put(_Placement(k, rows[k].component, rows[k].S_world_chunk, rows[k].covariance) for k in fresh)
         self._known = rows
-        self._library.touch(fresh)
 
     def place_unplaced(self) -> list[int]:
         """Give every chunk without a place one of its own, as repair needs it; their ids."""
