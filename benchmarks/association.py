@@ -145,12 +145,9 @@ def _judgement(plain: dict[str, Any]) -> Any:
 
 def run_video(job: tuple[str, int, Sequence[str], str]) -> list[dict[str, Any]]:
     """All variants on one simulated video."""
-    from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
     from benchmarks.feedforward_sim.feedforward import FeedForwardModel, FeedForwardSettings
-    from benchmarks.shared_work import SharedWork
     from benchmarks.simulation.presets import make_video
     from benchmarks.simulation.returns import make_return
-    from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 
     preset, seed, variants, joint_by = job
     video = make_return(preset, seed) if preset in RETURNS else make_video(preset, seed)
@@ -158,14 +155,25 @@ def run_video(job: tuple[str, int, Sequence[str], str]) -> list[dict[str, Any]]:
     if joint_by == "surfaces":
         errors = replace(errors, poses=replace(errors.poses, alike_least_score=float("inf")))
     model = FeedForwardModel(video, errors, seed=seed)
-    truth = _Truth(video, most_deg=180.0 if preset in RETURNS else None)
+    return run_variants(video, model, variants, most_deg=180.0 if preset in RETURNS else None)
+
+
+def run_variants(
+    video: Any, model: Any, variants: Sequence[str], *, most_deg: float | None = None, length: Any = None
+) -> list[dict[str, Any]]:
+    """Variants on one video and what a network makes of it, in chunks of a `length` (`ChunkSettings`)."""
+    from benchmarks.feedforward_sim.cuts import cuts_by_descriptor
+    from benchmarks.shared_work import SharedWork
+    from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
+
+    truth = _Truth(video, most_deg)
     work = SharedWork()
     joint = work.joint(model)
     cuts = cuts_by_descriptor(model.descriptors)
     chunks: dict[Any, Any] = {}
     rows = []
     for variant in variants:
-        spans = plan_chunks(len(video.time_s), ChunkSettings(), () if variant == "vggt-long" else cuts)
+        spans = plan_chunks(len(video.time_s), length or ChunkSettings(), () if variant == "vggt-long" else cuts)
         for span in spans:
             if span not in chunks:
                 chunks[span] = model.chunk(span)
@@ -173,7 +181,7 @@ def run_video(job: tuple[str, int, Sequence[str], str]) -> list[dict[str, Any]]:
         with work.used():
             row = run_variant(variant, [chunks[s] for s in spans], model, joint, truth)
         seconds = round(time.process_time() - started, 2)
-        rows.append({"preset": preset, "seed": seed, "variant": variant, "cpu_s": seconds, **row})
+        rows.append({"preset": video.preset, "seed": video.seed, "variant": variant, "cpu_s": seconds, **row})
     return rows
 
 
@@ -363,7 +371,8 @@ def _right_is_no_error(labels: NDArray[np.int8], chunks: NDArray[np.int64], erro
 
     pairs = np.sort(chunks, axis=1)
     right = {tuple(pair) for pair in pairs[errors_m <= FALSE_M].tolist()}
-    return np.where((labels == FALSE) & [tuple(pair) in right for pair in pairs.tolist()], np.int8(OPEN), labels)
+    measured = np.array([tuple(pair) in right for pair in pairs.tolist()], bool)
+    return np.where((labels == FALSE) & measured, np.int8(OPEN), labels)
 
 
 def _rigid(S: Any) -> Array:

@@ -3,10 +3,10 @@
 python benchmarks/bags.py --gigabytes 1 --json benchmarks/results/bags.json
 
 Raw pictures and depth of 640 x 480 with a camera and `/tf`, interleaved by time, are written by `rosbags` as mcap and
-db3, as mcap whose chunks are packed (`-zstd`) or whose last tenth and index are cut off (`-cut`), and as a bag of ROS
-1 packed by LZ4. A process of its own opens the recording and reads all frames; the disk's own speed is that of reading
-the file's bytes just before (it may lie in the system's cache both times). Speeds by processor time say what the reader
-costs on a machine that is busy with other work.
+db3, as mcap whose chunks are packed (`-zstd`), and as a bag of ROS 1 packed by LZ4. A process of its own opens the
+recording and reads all frames; the disk's own speed is that of reading the file's bytes just before (it may lie in the
+system's cache both times). Speeds by processor time say what the reader costs on a machine that is busy with other
+work.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ print(opened - started, time.monotonic() - opened, *cpu, first / 1024, peak / 10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gigabytes", type=float, default=1.0)
-    parser.add_argument("--kinds", default="mcap,db3,mcap-zstd,mcap-cut,bag-lz4")
+    parser.add_argument("--kinds", default="mcap,db3,mcap-zstd,bag-lz4")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows = []
@@ -111,9 +111,6 @@ def write(path: Path, kind: str, frames: int) -> Path:
             pictures = (image(time_s, "rgb8", 3 * WIDTH, color), image(time_s, "16UC1", 2 * WIDTH, depth))
             for topic, message in zip(topics, (*pictures, info, place(time_s)), strict=True):
                 writer.write(topic, int(1e9 * time_s), packed(message, topic.msgtype))
-    if kind.endswith("-cut"):
-        (whole,) = path.glob("*.mcap")
-        os.truncate(whole, whole.stat().st_size * 9 // 10)
     return path
 
 

@@ -26,7 +26,7 @@ import scale
 from machine import write_json
 from numpy.typing import NDArray
 
-from list3r.catalog.base import open_backend
+from list3r.catalog.backends import open_backend
 from list3r.catalog.catalog import Catalog
 from list3r.catalog.records import (
     CatalogAnswers,

@@ -41,14 +41,12 @@ import list3r
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import read_scene
 from list3r.frames.source import open_source, require_camera
-from list3r.memory.change.ledger import read_ledger
 from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.derivation import form
 from list3r.memory.library.evidence import EvidenceSettings
-from list3r.memory.library.grouping import Grouping
-from list3r.memory.library.region import DirtySet, Region
 from list3r.memory.library.rules import WORLD, ConsolidationSettings, settings_of
+from list3r.memory.library.scene import Scene
 from list3r.memory.library.uncertainty import OF_COMPUTED_DEPTH, ConfidenceWeights, Signs
-from list3r.memory.library.weighing import Weighing
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
@@ -167,7 +165,6 @@ def _with_everything(memory: Path) -> Path:
     copy = memory.with_suffix(".everything.l3r")
     shutil.copy(memory, copy)
     with Store.open(copy, writable=True) as store, store.transaction():
-        store.facts[WORLD] = None
         consolidate(store, None, ConsolidationSettings(evidence=EvidenceSettings(least_confidence=0.0)))
     return copy
 
@@ -176,15 +173,11 @@ def _signs(memory: Path) -> dict[int, tuple[Signs, float]]:
     """What tells how sure each instance is that is no structure, and how sure it is."""
     with Store.open(memory) as store:
         settings = settings_of(store, ConsolidationSettings())
-        world, ledger = store.facts[WORLD], read_ledger(store, store.chunks.all())
-        assert world is not None and ledger is not None
-        region = Region(store, chunk_summaries(store, settings.shapes), world, settings)
-        nothing = DirtySet(frozenset(), frozenset(), {}, frozenset(), whole=False)
-        grouping = Grouping(region, nothing, ledger)
-        groups = grouping.groups_in(region.rows)
-        weighed = Weighing(grouping).weigh_only(groups)
-        owners = store.observations.owners([key for group in groups for key in group])
-        evidence = {owners[g[0]]: e for g, e in weighed.evidence.items() if g[0] in owners}
+        world = store.facts[WORLD]
+        assert world is not None
+        weighed = form(Scene(store, chunk_summaries(store, settings.shapes), world, settings), ended=True).weighed
+        owners = store.observations.owners([key for group in weighed for key in group])
+        evidence = {owners[g[0]]: e for g, e in weighed.items() if g[0] in owners}
         listed = [i for i in store.instances.all() if i.structure is None]
         return {i.id: (e.signs, e.confidence) for i in listed if (e := evidence.get(i.id)) and e.signs}
 

@@ -105,7 +105,7 @@ def real(folder: Path, aliked: Path | None) -> dict[str, Any]:
     from list3r.frames.base import Camera, Frame
     from list3r.frames.options import SourceOptions
     from list3r.frames.source import open_source
-    from list3r.reconstruction.features.learned import make_detector
+    from list3r.reconstruction.features.detectors import make_detector
     from list3r.reconstruction.features.local import detect
     from list3r.reconstruction.features.settings import FeatureSettings
     from list3r.reconstruction.features.vlad import describe_frame

@@ -23,7 +23,8 @@ from list3r.frames.base import Frame, guessed_camera
 from list3r.frames.options import parse_distortion, parse_intrinsics
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
-from list3r.reconstruction.features.learned import LearnedDetector, make_detector
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.sfm.fill import PosedSegment
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 

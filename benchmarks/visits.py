@@ -1,14 +1,11 @@
-"""A simulated home filmed many times, other things moved, removed and added each time; with and without what later
-sessions saw again.
+"""A simulated home filmed many times, other things moved, removed and added each time.
 
 python benchmarks/visits.py --seeds 1,2 --json benchmarks/results/visits.json
 
-The walks go this way and that, in one memory. A local instance that as many later sessions as the row says saw again is
-looked at no more (`RedundancySettings.sessions`; 0: all are). After each visit the things that the memory lists are
-held against the truth of that visit, by boxes, and the events that it tells of the visit against what the camera could
-be the first to see then (`known_places.py`), as in `sessions.py`. `left_out` counts local instances that are looked at
-no more, `pairs` the pairs of chunks that are; `library_s` is processor time of the library, seconds. The totals count
-the visits from `--from` on, before which nothing is left out.
+The walks go this way and that, in one memory. After each visit the things that the memory lists are held against the
+truth of that visit, by boxes, and the events that it tells of the visit against what the camera could be the first to
+see then (`known_places.py`), as in `sessions.py`. `pairs` counts the pairs of chunks that overlap; `library_s` is
+processor time of the library, seconds. The totals count the visits from `--from` on.
 """
 
 from __future__ import annotations
@@ -30,7 +27,6 @@ from sessions import KINDS, ReturnWalk, measure
 import list3r
 from benchmarks.simulation.changes import random_changes
 from benchmarks.simulation.walks import ChangedWalk
-from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
 from list3r.memory.store.store import Store
 from list3r.pipeline import mapping
 from list3r.pipeline.settings import BuildSettings
@@ -64,7 +60,6 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2")
     parser.add_argument("--visits", type=int, default=7)
     parser.add_argument("--from", type=int, default=5, dest="first", help="visit from which it is counted")
-    parser.add_argument("--later", default="0,3", help="later sessions after which a local instance is left out")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="folder in which walks are kept")
     parser.add_argument("--json", type=Path)
@@ -74,16 +69,12 @@ def main() -> None:
         for seed in map(int, args.seeds.split(",")):
             walks = [filmed((args.keep or Path(scratch)) / str(seed), seed, n) for n in range(1, args.visits + 1)]
             known = KnownPlaces(walks)
-            for later in map(int, args.later.split(",")):
-                memory = Path(scratch) / f"{seed}-{later}.l3r"
-                for n in range(1, args.visits + 1):
-                    found = visited(memory, walks[:n], known, later, args.workers)
-                    rows.append({"later": later, "seed": seed, "visit": n, **found})
-                    print(json.dumps(rows[-1]), flush=True)
-    counted = [r for r in rows if r["visit"] >= args.first]
-    table = {
-        later: total([r for r in counted if r["later"] == later]) for later in dict.fromkeys(r["later"] for r in rows)
-    }
+            memory = Path(scratch) / f"{seed}.l3r"
+            for n in range(1, args.visits + 1):
+                found = visited(memory, walks[:n], known, args.workers)
+                rows.append({"seed": seed, "visit": n, **found})
+                print(json.dumps(rows[-1]), flush=True)
+    table = total([r for r in rows if r["visit"] >= args.first])
     print(machine())
     print(json.dumps(table, indent=1))
     write_json(args.json, {"from": args.first, "total": table, "visits": rows})
@@ -103,10 +94,9 @@ def filmed(root: Path, seed: int, visit: int) -> Path:
     return walk
 
 
-def visited(memory: Path, walks: Sequence[Path], known: KnownPlaces, later: int, workers: int) -> dict[str, Any]:
+def visited(memory: Path, walks: Sequence[Path], known: KnownPlaces, workers: int) -> dict[str, Any]:
     """Add the last walk to the memory of those before, and measure what it tells then."""
-    library = ConsolidationSettings(redundancy=RedundancySettings(sessions=later))
-    settings = BuildSettings(library=library, poses="estimate")
+    settings = BuildSettings(poses="estimate")
     if len(walks) == 1:
         list3r.build(walks[0], memory, settings=settings, workers=workers, force=True).close()
         return {}
@@ -127,7 +117,7 @@ def visited(memory: Path, walks: Sequence[Path], known: KnownPlaces, later: int,
         mapping.consolidate = consolidate
     with Store.open(before) as one, Store.open(memory) as two:
         found = measure(one, two, walks, known.due(len(walks) - 1))
-        left_out, pairs = len(two.library.redundant.superseded()), len(two.library.overlaps.all())
+        pairs = len(two.pair_scores.pairs())
     return {
         "events": found["events"],
         "false": found["false"],
@@ -136,7 +126,6 @@ def visited(memory: Path, walks: Sequence[Path], known: KnownPlaces, later: int,
         "ids_kept": found["ids_kept"],
         "unchanged": found["unchanged"],
         "library_s": round(sum(spent), 2),
-        "left_out": left_out,
         "pairs": pairs,
     }
 

@@ -4,10 +4,10 @@
 
 Each simulated walk goes to and fro between two rooms and films them from a new place each time; a frame is kept after
 each step: 8 cm or 4 degrees, whichever comes first (`--hard`: 6 degrees, and the camera touches door frames, as in
-decision 0074). The real one is every eighth frame of a folder with poses. Both programs get the same pictures and focal
-length (plain pycolmap: `benchmarks/sfm.py`). `cpu_s_a_frame` is that of all processes of the program; with two idle
-cores a frame takes half of it or little more. In `--keep` what each program made of a walk is noted, ours by its
-commit, and not made again.
+research/colour-video 0074). The real one is every eighth frame of a folder with poses. Both programs get the same
+pictures and focal length (plain pycolmap: `benchmarks/sfm.py`). `cpu_s_a_frame` is that of all processes of the
+program; with two idle cores a frame takes half of it or little more. In `--keep` what each program made of a walk is
+noted, ours by its commit, and not made again.
 """
 
 from __future__ import annotations

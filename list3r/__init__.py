@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from list3r.pipeline.request import BuildRequest
     from list3r.pipeline.settings import BuildSettings
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "BuildRequest",
     "BuildSettings",

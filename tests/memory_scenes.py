@@ -11,6 +11,7 @@ from list3r.memory.constraints import Constraints
 from list3r.memory.geometry import Sim3
 from list3r.memory.merging.edges import Key, MergeSettings, form_groups, links_of, pair_scores
 from list3r.memory.merging.nodes import Nodes
+from list3r.memory.overlap.pair_scores import Numbering, PairTable
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes
 from list3r.memory.records import MergeDecision, Support
 from list3r.memory.store.tables.local_instances import LocalNode
@@ -157,14 +158,13 @@ def merge_nodes(
     cannot_link: Sequence[tuple[Key, Key]],
     constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """Group the local instances of whole chunks, which `form_groups` is given piece by piece, by the defaults."""
+    """Group the local instances of chunks, by the defaults."""
     s, grown = MergeSettings(), GrownCells()
     chunks = sorted(chunks, key=lambda c: c.chunk_id)
-    tables = {c.chunk_id: Nodes.of([c], S_world_chunk) for c in chunks}
-    links = {}
+    nodes, scores = Nodes.of(chunks, S_world_chunk), {}
     for n, u in enumerate(chunks):
         for v in chunks[n:]:
             S_u_v = S_world_chunk[u.chunk_id].inverse() @ S_world_chunk[v.chunk_id]
-            scores = pair_scores(u, v, S_u_v, grown)
-            links[u.chunk_id, v.chunk_id] = links_of(tables[u.chunk_id], tables[v.chunk_id], scores, s)
-    return form_groups(tables, links, None, cannot_link, s, constraints)
+            scores[u.chunk_id, v.chunk_id] = pair_scores(u, v, S_u_v, grown)
+    links = links_of(nodes, PairTable.of(scores, Numbering({c.chunk_id: c for c in chunks})), s)
+    return form_groups(nodes, links, cannot_link, s, constraints)

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from list3r.batch.engines.base import TaskResources, make_engine
+from list3r.batch.engines.base import TaskResources
+from list3r.batch.engines.choice import make_engine
 from list3r.batch.engines.local import LocalEngine
 from list3r.batch.ledger import Ledger
 from list3r.batch.runner import BatchReport, BatchSettings, run_batch, run_here
@@ -268,7 +269,7 @@ def test_a_process_that_is_killed_costs_its_own_task_alone(tmp_path: Path) -> No
 
 
 def test_ray_makes_the_same_files(folder: Path, built: tuple[Path, BatchReport]) -> None:
-    pytest.importorskip("ray", reason="ray is not installed (240 MB, ten seconds to start): pip install 'list3r[ray]'")
+    pytest.importorskip("ray", reason="ray is not installed (240 MB, ten seconds to start): pip install '.[ray]'")
     groups: list[list[BatchTask]] = read_tasks(str(folder / "videos.jsonl"), ASKED)
     engine = make_engine("ray", TaskResources(), None, None)
     report = run_batch(groups, engine, BatchSettings(str(folder / "ray")))
@@ -283,7 +284,7 @@ def test_chunks_of_one_video_on_ray_make_the_same_file(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also by a path from the folder that the command was given in; what is wrong with a video is said as ever."""
-    pytest.importorskip("ray", reason="ray is not installed (240 MB, ten seconds to start): pip install 'list3r[ray]'")
+    pytest.importorskip("ray", reason="ray is not installed (240 MB, ten seconds to start): pip install '.[ray]'")
     monkeypatch.chdir(folder)
     request = BuildRequest(chunk=3, overlap=1)
     hashes = set()

@@ -19,7 +19,7 @@ from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
-from tests.program import in_process
+from tests.program import in_process, with_signals
 
 OPTIONS = ("--chunk", "10", "--overlap", "3")
 
@@ -33,7 +33,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def start(walk: Path, memory: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "list3r", "build", str(walk), "-m", str(memory), *OPTIONS, *more]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=with_signals)
 
 
 def build(walk: Path, memory: Path, *more: str) -> None:

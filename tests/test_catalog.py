@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from list3r.catalog import Catalog
-from list3r.catalog.base import open_backend
+from list3r.catalog.backends import open_backend
 from list3r.catalog.catalog import box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.cli.app import run as list3r
-from list3r.memory.errors import List3rError, OptionError, UnknownIdError
+from list3r.memory.errors import List3rError, OptionError, SpaceMismatchError, UnknownIdError
 from list3r.memory.geometry import OrientedBox, rotation_exp
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
@@ -35,7 +35,7 @@ STRANGE = ("x'; DROP TABLE memory; --", '"%s ? $1 {}', "\\", "a\x00b", "mug' OR 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
-    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'list3r[catalog]'")
+    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install '.[catalog]'")
     with running_postgres() as found:
         yield found
 
@@ -183,6 +183,56 @@ def test_vectors_find_what_is_alike(catalog: Catalog) -> None:
         catalog.similar(vector=np.ones(3), space=SPACE)
     with pytest.raises(OptionError, match="not all zero"):
         catalog.similar(vector=np.zeros(16), space=SPACE)
+
+
+@pytest.mark.parametrize("length", [1e38, 1e-38, 1e300, 1e-300])
+def test_how_long_a_vector_is_does_not_matter(catalog: Catalog, length: float) -> None:
+    query = content("random").spaces[0].vectors[3].astype(np.float64)
+    skip_without_vectors(catalog)
+    found = [(m.memory, m.id) for m in catalog.similar(vector=query, space=SPACE, k=9)]
+    assert [(m.memory, m.id) for m in catalog.similar(vector=length * query, space=SPACE, k=9)] == found
+    assert found[0] == ("random", 3)
+
+
+@pytest.mark.parametrize("length", [5e37, 1e-37])
+def test_how_long_a_stored_vector_is_does_not_matter(catalog: Catalog, length: float) -> None:
+    skip_without_vectors(catalog)
+    held = looking("long", 50, 3, f"long{length}@1/16")
+    usual = held.spaces[0].vectors
+    catalog._backend.put(replace(held, spaces=[replace(held.spaces[0], vectors=usual * np.float32(length))]))
+    found = catalog.similar("long", instance_id=4, anywhere=False)
+    catalog.remove("long")
+    cosine = usual @ usual[4] / np.linalg.norm(usual, axis=1) / np.linalg.norm(usual[4])
+    assert [m.score for m in found] == pytest.approx([cosine[m.id] for m in found], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("vector", "space", "said"),
+    [
+        (np.ones(3), SPACE, "3 numbers does not belong to test@1/16, which has 16"),
+        (np.ones(16), "none@1/16", "no vectors of none@1/16; it has: .*test@1/16"),
+        ([*np.ones(15), np.inf], SPACE, "finite numbers"),
+        ([10**400] * 16, SPACE, "finite numbers"),
+        (["a"] * 16, SPACE, "finite numbers"),
+    ],
+)
+def test_vectors_that_cannot_be_compared_are_refused(catalog: Catalog, vector: Any, space: str, said: str) -> None:
+    skip_without_vectors(catalog)
+    with pytest.raises((OptionError, SpaceMismatchError), match=said):
+        catalog.similar(vector=vector, space=space)
+
+
+def test_a_space_has_vectors_of_one_dimension(catalog: Catalog) -> None:
+    skip_without_vectors(catalog)
+    held = content("short")
+    short = SpaceVectors(SPACE, np.arange(2), np.ones((2, 3), np.float32))
+    with pytest.raises(CatalogError, match="3 numbers do not belong to test@1/16, which has 16"):
+        catalog._backend.put(replace(held, spaces=[short]))
+
+
+def skip_without_vectors(catalog: Catalog) -> None:
+    if not getattr(catalog._backend, "has_vectors", True):
+        pytest.skip("the server has no pgvector")
 
 
 @pytest.fixture
@@ -368,6 +418,45 @@ def test_files_are_read_and_changes_of_them_noticed(catalog: Catalog, room: Path
         catalog.find("vase", "room")
     with pytest.raises(UnknownIdError):
         catalog.nearest("random", instance_id=4000)
+
+
+@pytest.mark.parametrize("name", ["../../x", "/x", "a/b", "..", "", "a\\b", "a\nb", "x" * 101])
+def test_a_name_that_could_lead_elsewhere_is_refused(catalog: Catalog, room: Path, tmp_path: Path, name: str) -> None:
+    def held() -> tuple[list[MemoryEntry], list[Path]]:
+        return catalog.memories(), sorted(tmp_path.rglob("*"))
+
+    before, kept = held(), str(tmp_path / "a" / "b" / "kept")
+    for take in (lambda: catalog.add(room, name, kept), lambda: catalog.again(str(room), name)):
+        with pytest.raises(OptionError, match="cannot be the name of a memory"):
+            take()
+    assert held() == before
+
+
+def test_a_name_of_another_catalogue_is_asked_and_forgotten_but_not_written_again(
+    url: str, catalog: Catalog, room: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a catalogue that somebody else has made may hold it."""
+    held = content("../../x")
+    backend = open_backend(url)
+    backend.put(replace(held, entry=replace(held.entry, path=str(room))))
+    backend.close()
+    assert catalog.find("mug", "../../x")
+    assert list3r(["catalog", "rebuild", "--catalog", url]) == 2
+    assert "'../../x' cannot be the name of a memory" in capsys.readouterr().err
+    assert list3r(["catalog", "remove", "../../x", "--catalog", url]) == 0
+
+
+def test_the_command_refuses_names_that_could_lead_elsewhere(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url, before = str(tmp_path / "c.sqlite"), list(tmp_path.parent.rglob("*"))
+    add = ["catalog", "add", "--catalog", url, "--store", str(tmp_path / "kept")]
+    assert list3r([*add, str(room), "--name", "../../x"]) == 2
+    room.rename(strange := room.with_name("a room.l3r"))
+    assert list3r([*add, str(strange)]) == 2
+    assert "rename the file" in capsys.readouterr().err
+    assert {p.name for p in set(tmp_path.parent.rglob("*")) - set(before)} == {"a room.l3r", "c.sqlite"}
+    assert list3r([*add, str(strange), "--name", "room"]) == 0
 
 
 def test_a_memory_that_is_being_written_is_not_catalogued(room: Path) -> None:

@@ -13,7 +13,7 @@ from list3r.memory.maintenance.history import world_at
 from list3r.memory.records import ChangeEvent
 from list3r.memory.store.store import Store
 from tests.session_scenes import Box, metric_store
-from tests.test_growth_sessions import APART_M, film, house, moved
+from tests.test_derived_sessions import APART_M, film, house, moved
 
 AT_FIRST, AT_SECOND, AT_STAND = [(0, 0.4), (0, 1.5)], [(1, 0.9), (1, 2.0)], [(2.6 / APART_M, 3.5)]
 EVERYWHERE = AT_FIRST + AT_SECOND + AT_STAND

@@ -59,6 +59,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     corrupt = write_frames(root / "corrupt", count=6)
     for k in range(5):
         (corrupt / f"rgb/{k}.png").write_bytes(b"not a picture")
+    shutil.copytree(corrupt, root / "ruined")
+    (root / "ruined/rgb/5.png").write_bytes(b"not a picture")
     listed = write_frames(root / "unlisted")
     (listed / "depth.txt").unlink()
     (root / "empty").mkdir()
@@ -109,7 +111,7 @@ CASES = {
     "depth of another size": ("build {p}/small-depth -m {p}/new.l3r", "32x20.*--depth-intrinsics|--depth-intrinsics"),
     "no depth": ("build {p}/pictures -m {p}/new.l3r --intrinsics 60,60,32,24 --reconstruction rgbd", "no depth"),
     "depth list missing": ("build {p}/unlisted -m {p}/new.l3r --reconstruction rgbd", "depth"),
-    "mostly corrupt": ("build {p}/corrupt -m {p}/new.l3r --workers 1", "5 of 6"),
+    "all corrupt": ("build {p}/ruined -m {p}/new.l3r --workers 1", "none of 6 frames tried can be decoded"),
     "no poses to be given": ("build {p}/unposed -m {p}/new.l3r --poses given", "no poses.*estimate"),
     "memory is a folder": ("build {p}/good -m {p}/empty", "is a folder"),
     "memory in no folder": ("build {p}/good -m {p}/no/where/new.l3r", "does not exist"),
@@ -220,7 +222,7 @@ MORE_CASES = {
 }
 
 
-AS_USER = ("not a video", "mostly corrupt", "memory exists")
+AS_USER = ("not a video", "all corrupt", "memory exists")
 """Cases that run as a process too: libraries that print by themselves, and the exit status."""
 
 

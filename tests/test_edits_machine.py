@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,6 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from list3r.memory.constraints import Key
 from list3r.memory.errors import UnknownIdError
 from list3r.memory.library import consolidation
-from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.maintenance import edits
 from list3r.memory.store.store import Store
 from tests.conftest import THOROUGH
@@ -62,7 +60,7 @@ class StoreAgainstModel(RuleBasedStateMachine):
         """A memory whose library grows from the first chunk on, or is derived as a whole each time."""
         self.patch = pytest.MonkeyPatch()
         if grows:
-            self.patch.setattr(consolidation, "ConsolidationSettings", partial(ConsolidationSettings, whole_chunks=0))
+            self.patch.setattr(consolidation, "_ALWAYS", 2)
         self.folder = tempfile.TemporaryDirectory(dir=IN_MEMORY if os.access(IN_MEMORY, os.W_OK) else None)
         self.path = Path(self.folder.name) / "a.l3r"
         self.store = create(self.path)

@@ -6,6 +6,7 @@ import csv
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -191,6 +192,21 @@ def test_csv_keeps_labels_with_commas_and_quotes(make_memory: Callable[..., Path
         write_csv(memory.store, tmp_path / "room.csv")[0].open(newline="") as file,
     ):
         assert next(row for row in csv.DictReader(file) if row["id"] == "3")["label"] == label
+
+
+@pytest.mark.parametrize("label", ["=HYPERLINK(A1)", "+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "＝1"])
+def test_csv_holds_no_formula(label: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
+    path = make_memory()
+    with Store.open(path, writable=True) as store, store.transaction():
+        store.instances.put([replace(store.instances.get(3), label=label, description=label)])
+    with Store.open(path) as store, write_csv(store, tmp_path / "m.csv")[0].open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+        columns = dict(zip(rows[0], zip(*rows[1:], strict=True), strict=True))
+        assert columns["label"][2] == columns["description"][2] == f"'{label}"
+        assert columns["description"][1] == "table"
+        lowest = columns["min_x"] + columns["min_y"]
+        assert min(map(float, lowest)) < 0 and not [v for v in lowest if v.startswith("'")]
+        assert records_of(store)[2]["label"] == label
 
 
 def test_csv_of_an_empty_memory_names_the_columns(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from list3r.memory.maintenance import edits
 from list3r.memory.store.file import check_beside
 from list3r.memory.store.lock import WriterLock, lock_path
 from list3r.memory.store.store import Store
+from tests.program import as_user
 
 Make = Callable[..., Path]
 PRECIOUS = b"my own words, 92 bytes of which an earlier program left; they stay\n" * 40
@@ -91,6 +93,20 @@ def test_a_lock_that_was_left_behind_is_taken_over(make_memory: Make, tmp_path: 
     lock_path(memory).write_bytes(left)
     Store.open(memory, writable=True).close()
     assert [p.name for p in tmp_path.iterdir()] == [memory.name]
+
+
+@pytest.mark.parametrize("most_bytes", [0, 50, 8192])
+def test_an_edit_on_a_full_disk_names_the_file_and_leaves_nothing(most_bytes: int, make_memory: Make) -> None:
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+    memory = make_memory()
+    before = memory.read_bytes()
+    result = as_user("label", memory, "2", "mug", before=small_files)
+    assert result.returncode == 2 and result.stderr.count("\n") == 1, result.stderr
+    assert str(memory) in result.stderr and "free some space" in result.stderr
+    assert [p.name for p in memory.parent.iterdir()] == [memory.name] and memory.read_bytes() == before
+    assert run(["label", str(memory), "2", "mug"]) == 0
 
 
 def test_a_new_memory_takes_no_name_but_its_own(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -122,6 +123,30 @@ def test_output_that_cannot_be_written_is_said_where_it_can(stream: str, state: 
         assert "cannot be written" in told.stderr and "is done" in told.stderr
     with Store.open(path) as store:
         assert store.instances.get(2).label == "mug"
+
+
+def test_blanks_within_a_name_make_no_column(make_memory: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    path = make_memory()
+    with Store.open(path, writable=True) as store, store.transaction():
+        store.instances.put([replace(store.instances.get(3), label="mug   9.00  9.00")])
+    assert run(["list", str(path)]) == 0
+    assert r"3   mug \x20\x209.00 \x209.00  " in capsys.readouterr().out
+
+
+def test_a_server_without_standard_input_ends(make_memory: Make) -> None:
+    pytest.importorskip("mcp")
+    command = f"{sys.executable} -m list3r mcp {make_memory()} <&-"
+    told = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
+    assert (told.returncode, told.stdout, told.stderr) == (0, "", "")
+
+
+def test_clocks_a_day_from_greenwich_are_clocks(make_memory: Make) -> None:
+    """Python has no time zone of 24 hours, which systems allow."""
+    path = make_memory()
+    environment = {**os.environ, "TZ": "<+24>-24"}
+    for command in (["label", path, "2", "desk"], ["info", path], ["merges", path], ["query", "seen", path, "2"]):
+        told = program(*command, env=environment, capture_output=True)
+        assert (told.returncode, told.stderr) == (0, "")
 
 
 def test_links_that_lead_to_themselves_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,10 +18,8 @@ import list3r
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.frames.live.addresses import is_stream, without_secrets
 from list3r.frames.live.feed import FeedState, LiveSettings
-from list3r.frames.live.growing import FolderFeed
 from list3r.frames.live.spooled import StreamFeed
 from list3r.frames.live.stream import NetworkStream
-from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.frames.writers.pictures import jpeg
 from list3r.memory.errors import OptionError, SourceError
@@ -29,8 +27,6 @@ from list3r.memory.store.store import Store
 from list3r.pipeline.live import build_live, ready_spans
 from list3r.pipeline.request import BuildRequest, RunOptions
 from list3r.simulation.dataset import WalkSettings, write_walk
-from tests.recordings import COUNT, write_bag
-from tests.test_frames_rosbag import file_of
 
 QUICK = LiveSettings(retry_s=1.0, pause_s=0.05, silence_s=1.0, idle_s=1.0, poll_s=0.05)
 
@@ -174,45 +170,6 @@ def test_a_folder_that_grows_becomes_a_memory_that_can_be_asked_meanwhile(tmp_pa
     assert seen == [1]
     with list3r.open(memory) as scene:
         assert len(scene) == report.instances
-
-
-@pytest.mark.parametrize("kind", ["bag", "mcap"])
-def test_a_bag_that_is_recorded_is_followed(kind: str, tmp_path: Path) -> None:
-    whole = write_bag(tmp_path / "walk", kind, chunk_bytes=20_000)
-    data = file_of(whole, kind).read_bytes()
-    growing = tmp_path / f"growing.{kind}"
-    feed = FolderFeed(growing, SourceOptions(), QUICK)
-    seen = []
-    for share in (0.2, 0.6, 0.9, 1.0):
-        growing.write_bytes(data[: int(share * len(data))])
-        time.sleep(2 * QUICK.poll_s)
-        state = feed.state()
-        seen.append((state.received, state.ended))
-    assert [ended for _, ended in seen] == [False] * 4 and seen[-1][0] == COUNT
-    assert seen[0][0] <= seen[1][0] < seen[2][0] <= seen[3][0]
-    while not feed.state().ended:
-        time.sleep(QUICK.poll_s)
-    assert feed.state().count == COUNT
-
-
-def test_a_recorded_bag_becomes_a_memory(tmp_path: Path) -> None:
-    whole = file_of(write_bag(tmp_path / "walk", "mcap", chunk_bytes=20_000), "mcap").read_bytes()
-    growing, memory = tmp_path / "growing.mcap", tmp_path / "m.l3r"
-
-    def record() -> None:
-        with growing.open("wb") as file:
-            for start in range(0, len(whole), 40_000):
-                file.write(whole[start : start + 40_000])
-                file.flush()
-                time.sleep(0.1)
-
-    writer = threading.Thread(target=record)
-    writer.start()
-    report = build_live(
-        growing, memory, settings=BuildRequest(poses="given"), run=RunOptions(live=True, workers=1), live=QUICK
-    )
-    writer.join()
-    assert report.live is not None and (report.posed, report.live.dropped) == (COUNT, 0)
 
 
 def _chunks_by(memory: Path) -> int:

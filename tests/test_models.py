@@ -91,7 +91,7 @@ def test_every_adapter_has_a_card_and_every_card_an_adapter() -> None:
     carded = {(c.part, c.name) for c in CARDS}
     assert known <= carded
     assert {pair for pair in carded if pair[0] in ("geometry", "discovery", "tracking", "features")} == known
-    assert all(c.part in PARTS and c.packages and c.install for c in CARDS)
+    assert all(c.part in PARTS and c.packages and c.installed_by for c in CARDS)
     assert len(carded) == len(CARDS)
 
 

@@ -1,7 +1,8 @@
 """VGGT-Long's and Pi-Long's way, held against what their published code gave on cases made by hand.
 
 `tests/published_cases.py` was run through LoopModel.py, sim3utils.py and sim3loop.py of VGGT-Long (6b9f61f) and of
-Pi-Long (ae567d9), which gave the same numbers; they stand here. docs/decisions/0150 has a comparison on random cases.
+Pi-Long (ae567d9), which gave the same numbers; they stand here. research/association 0150 has a comparison on random
+cases.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from list3r.queries.relations import relations
 from list3r.queries.seen import seen
 from list3r.queries.similar import similar
 from list3r.queries.within import within
-from tests.conftest import instance
+from tests.conftest import instance, write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
 
@@ -179,6 +179,32 @@ def test_relations_are_filtered_and_checked(store: Store) -> None:
     assert [r.confidence for r in found] == sorted((r.confidence for r in found), reverse=True)
     with pytest.raises(OptionError, match="choose one of: on"):
         relations(store, predicate="upon")
+
+
+@pytest.mark.parametrize("length", [1e38, 1e-38, 1e300, 1e-300])
+def test_how_long_a_vector_is_does_not_matter(store: Store, length: float) -> None:
+    (space,) = store.embeddings.spaces()
+    known, vectors = store.embeddings.all(space)
+    query = vectors[list(known).index(MUG)].astype(np.float64)
+    found = [(m.instance.id, m.score) for m in similar(store, vector=query, space=space, k=9)]
+    assert found[0] == (MUG, 1.0)
+    assert [(m.instance.id, m.score) for m in similar(store, vector=length * query, space=space, k=9)] == found
+
+
+@pytest.mark.parametrize("length", [1e38, 1e-37])
+def test_how_long_a_stored_vector_is_does_not_matter(tmp_path: Path, length: float) -> None:
+    told = []
+    for by in (1.0, length):
+        with Store.create(tmp_path / f"{by}.l3r") as store:
+            with store.transaction():
+                write_small_room(store)
+                (space,) = store.embeddings.spaces()
+                ids, vectors = store.embeddings.all(space)
+                unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+                store.embeddings.put(space, ids.tolist(), unit * np.float32(by))
+            told.append([(m.instance.id, m.score) for m in similar(store, instance_id=MUG, k=9)])
+    assert told[0] and [i for i, _ in told[1]] == [i for i, _ in told[0]]
+    assert [s for _, s in told[1]] == pytest.approx([s for _, s in told[0]], abs=1e-3)
 
 
 def test_similar_is_the_exact_cosine_order(store: Store) -> None:

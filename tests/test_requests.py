@@ -11,7 +11,7 @@ from list3r.frames.base import Camera, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import OptionError
-from list3r.memory.library.rules import ConsolidationSettings
+from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
 from list3r.memory.store.store import Store
 from list3r.pipeline.choice import (
     check_beside,
@@ -62,8 +62,8 @@ def test_a_later_session_takes_the_stages_of_the_first_and_what_is_asked_for() -
     assert later.association == BEGUN.association and (later.reconstruction, later.poses) == ("sfm", "auto")
     assert later.chunks == asked.chunks and later.keep_pictures
     check_beside(later, BEGUN)
-    with pytest.raises(OptionError, match="whole_chunks"):
-        check_beside(replace(BEGUN, library=ConsolidationSettings(whole_chunks=3)), BEGUN)
+    with pytest.raises(OptionError, match="redundancy"):
+        check_beside(replace(BEGUN, library=ConsolidationSettings(redundancy=RedundancySettings(chunks=3))), BEGUN)
 
 
 def test_frames_of_a_later_session_are_described_as_the_first_ones_or_it_is_said() -> None:

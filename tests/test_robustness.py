@@ -9,17 +9,20 @@ from pathlib import Path
 import pytest
 
 import list3r
+from list3r.cli.build.progress import build_interrupted
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 from tests.program import in_process as run
+from tests.program import with_signals
 from tests.test_cli_errors import write_frames
 
 
-def build_ended(walk: Path, memory: Path, end: str, *more: str) -> subprocess.CompletedProcess[str]:
+def build_ended(walk: Path, memory: Path, end: str, *more: str, first: str = "") -> subprocess.CompletedProcess[str]:
     """A build of the real program that is ended, by the statement `end`, as its first chunk is to be added."""
     program = f"""
 import os, signal, sys
 import list3r.pipeline.session
+{first}
 from list3r.cli import main
 def add_chunk(*_, **__):
     {end}
@@ -28,7 +31,7 @@ sys.argv[1:] = ["build", {str(walk)!r}, "-m", {str(memory)!r}, "--poses", "given
 main()
 """
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, preexec_fn=with_signals)
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +65,47 @@ def test_a_build_that_is_told_to_end_leaves_nothing_half_written(name: str, walk
     assert result.returncode == 1
     assert "nothing was changed" in result.stderr and "Traceback" not in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+SIGNALLED = """
+import list3r.memory.store.store as module
+def signalled(name, real):
+    def first(*arguments, **named):
+        os.kill(os.getpid(), signal.SIGINT)
+        return real(*arguments, **named)
+    setattr(module.{owner}, name, first)
+signalled("{name}", module.{owner}.{name})
+"""
+
+
+@pytest.mark.parametrize("more", [[], ["--force"]])
+@pytest.mark.parametrize("where", ["Store.close", "Connection._connect"])
+def test_ctrl_c_while_a_memory_is_made_or_given_up_leaves_none(
+    where: str, more: list[str], walk: Path, tmp_path: Path
+) -> None:
+    memory = tmp_path / "room.l3r"
+    if more:
+        write_room(memory)
+    owner, name = where.split(".")
+    first = SIGNALLED.format(owner=owner, name=name) + "import list3r.pipeline.target\n"
+    result = build_ended(walk, memory, "os.kill(os.getpid(), signal.SIGINT); signal.pause()", *more, first=first)
+    assert result.returncode == 1 and "nothing was changed" in result.stderr and "Traceback" not in result.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["room.l3r"] * len(more)
+    if more:
+        with list3r.open(memory) as scene:
+            assert len(scene.instances(structure=None)) == 6
+
+
+def test_what_is_said_of_an_interrupted_build_is_true(tmp_path: Path) -> None:
+    memory = tmp_path / "room.l3r"
+    said = build_interrupted(memory, False)
+    assert "nothing was changed" in said(False)
+    Store.create(memory).close()
+    assert "nothing was changed" not in said(False) and str(memory) in said(False)
+    said = build_interrupted(memory, False)
+    memory.rename(tmp_path / "room.l3r.replaced")
+    Store.create(memory).close()
+    assert "room.l3r.replaced" in said(False)
 
 
 def test_an_interrupted_replacement_leaves_the_old_memory(walk: Path, tmp_path: Path) -> None:
@@ -123,5 +167,5 @@ main()
     out = tmp_path / "room.json"
     arguments = ["export", str(write_room(tmp_path / "room.l3r")), "--to", "json", "--out", str(out)]
     command = [sys.executable, "-c", program, *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, preexec_fn=with_signals)
     assert (result.returncode, result.stdout, result.stderr.strip()) == (1, "", "interrupted")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import os
@@ -9,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -51,7 +53,7 @@ class Service:
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    pytest.importorskip("fastapi", reason="fastapi is not installed: pip install 'list3r[serve]'")
+    pytest.importorskip("fastapi", reason="fastapi is not installed: pip install '.[serve]'")
     folder = tmp_path_factory.mktemp("service")
     with Catalog.open(str(folder / "catalog.sqlite")) as catalog:
         for name in ("one", "two"):
@@ -146,6 +148,35 @@ def test_what_makes_no_sense_is_explained(service: Service, path: str, status: i
     assert "\n" not in found[1]["error"]["message"]
 
 
+@pytest.mark.parametrize(
+    ("asked", "status", "said"),
+    [
+        ({"vector": [1.0] * 15}, 400, "15 numbers does not belong to test@1/16"),
+        ({"vector": [1.0] * 16, "space": "none@1/16"}, 400, "no vectors of none@1/16"),
+        ({"vector": [0.0] * 16}, 400, "not all zero"),
+        ({"vector": [float("inf")] * 16}, 400, "finite numbers"),
+        ({"vector": [1.0] * 16, "memory": "../../x"}, 404, "no memory"),
+    ],
+)
+def test_vectors_that_cannot_be_compared_are_explained(
+    service: Service, asked: dict[str, Any], status: int, said: str
+) -> None:
+    found = service.get("/v1/similar", method="POST", body={"space": "test@1/16"} | asked)
+    assert found[0] == status == found[1]["error"]["status"]
+    assert said in found[1]["error"]["message"]
+
+
+@pytest.mark.parametrize("length", [1e38, 1e-38, 1e300])
+def test_how_long_a_vector_is_does_not_matter(service: Service, length: float) -> None:
+    vector = [float(n % 3 - 1) for n in range(16)]
+    told = [
+        service.get("/v1/similar", method="POST", body={"vector": [by * x for x in vector], "space": "test@1/16"})
+        for by in (1.0, length)
+    ]
+    assert told[0][0] == 200 and told[0][1]["matches"]
+    assert told[1] == told[0]
+
+
 @pytest.mark.parametrize("text", ["x'; DROP TABLE memory; --", "%s%s", "\x00", '") OR 1=1', "../../etc/passwd"])
 def test_what_is_asked_is_never_part_of_a_statement(service: Service, text: str) -> None:
     for path in ("/v1/find?text={}", "/v1/memories/{}", "/v1/relations?subject={}", "/v1/find?text=mug&memory={}"):
@@ -196,6 +227,95 @@ def test_slow_clients_are_let_go(service: Service) -> None:
     headers, body = service.slow
     assert headers.recv(1000) == b""
     assert b" 408 " in body.recv(1000).splitlines()[0]
+
+
+ANSWERED = f"GET /v1/memories HTTP/1.1\r\nHost: a\r\nAuthorization: Bearer {make_token(SECRET, 1.0)}\r\n\r\n"
+WAITING, BODY = "GET /health HTTP/1.1\r\nHos", "GET /health HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n{"
+"""Without the end of the headers, and of the body."""
+
+
+def status_of(client: socket.socket) -> int:
+    """The status of an answer, which is read whole."""
+    answer = http.client.HTTPResponse(client)
+    answer.begin()
+    answer.read()
+    return answer.status
+
+
+@contextlib.contextmanager
+def clients(port: int, count: int, *texts: str) -> Iterator[list[socket.socket]]:
+    """Clients that have sent each of some texts, the next one when the one before was answered."""
+    with contextlib.ExitStack() as held:
+        found = []
+        for _ in range(count):
+            client = held.enter_context(socket.create_connection(("127.0.0.1", port), timeout=30))
+            for n, text in enumerate(texts):
+                if n:
+                    assert status_of(client) == 200
+                client.sendall(text.encode())
+            found.append(client)
+        yield found
+
+
+def test_without_a_token_a_connection_has_one_request(service: Service) -> None:
+    with clients(service.port, 1, f"{WAITING}t: a\r\n\r\n" * 2) as (client,):
+        assert status_of(client) == 200
+        assert client.recv(1000) == b""
+
+
+def test_every_request_of_a_connection_has_its_limit_of_time(service: Service) -> None:
+    with clients(service.port, 20, ANSWERED, WAITING) as half, clients(service.port, 20, ANSWERED, ANSWERED) as idle:
+        assert {status_of(client) for client in idle} == {200}
+        assert {client.recv(1000) for client in (*half, *idle)} == {b""}
+
+
+@pytest.mark.parametrize("texts", [(), (ANSWERED, WAITING), (WAITING,), (BODY,)])
+def test_slow_clients_make_room_for_others(service: Service, texts: tuple[str, ...]) -> None:
+    """Those of the same address, too, and those first that have waited longest."""
+    with clients(service.port, 300, *texts) as slow:
+        assert {service.get("/v1/find?text=mug")[0] for _ in range(20)} == {200}
+        with contextlib.suppress(ConnectionResetError):
+            assert slow[0].recv(1000) == b""
+        slow[-1].settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            slow[-1].recv(1000)
+
+
+def test_a_client_that_takes_no_answers_is_let_go(service: Service) -> None:
+    with socket.socket() as client, pytest.raises(ConnectionError):
+        client.settimeout(60)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", service.port))
+        while True:  # until the service takes no more, and then ends the connection
+            client.sendall(ANSWERED.replace("memories", "openapi.json").encode() * 1000)
+    assert service.get("/health", token="")[0] == 200
+
+
+def test_what_is_being_answered_keeps_its_place(tmp_path: Path) -> None:
+    """Two requests wait for the database, which are as many as may: others are told so, and cost them nothing."""
+    uvicorn = pytest.importorskip("uvicorn", reason="uvicorn is not installed: pip install 'list3r[serve]'")
+    from list3r.service.app import make_service
+    from list3r.service.limits import ServiceLimits
+    from list3r.service.running import server_config
+
+    limits = ServiceLimits(request_s=60.0, at_once=2, open_at_once=8, of_one_address=4)
+    with Catalog.open(str(tmp_path / "catalog.sqlite")) as catalog, socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        server = uvicorn.Server(server_config(make_service(catalog, SECRET, limits), limits))
+        running = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        running.start()
+        try:
+            with contextlib.ExitStack() as held:
+                with catalog._backend._turn:  # type: ignore[attr-defined]
+                    early = held.enter_context(clients(port, 2, ANSWERED))
+                    (late,) = held.enter_context(clients(port, 1, ANSWERED))
+                    assert status_of(late) == 503
+                    waiting = held.enter_context(clients(port, 20, WAITING))
+                    assert waiting[0].recv(1000) == b""
+                assert {status_of(client) for client in early} == {200}
+        finally:
+            server.should_exit = True
+            running.join()
 
 
 def test_health_and_counts(service: Service) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.library.rules import ConsolidationSettings, settings_of
+from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings, settings_of
 from list3r.memory.settings import from_plain, stored_settings
 from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.store import Store
@@ -84,12 +84,12 @@ def test_what_does_not_fit_is_refused(plain: Any) -> None:
 
 
 def test_a_memory_is_derived_by_the_settings_of_its_first_session(tmp_path: Path) -> None:
-    first = BuildSettings(library=ConsolidationSettings(whole_chunks=3))
+    first = BuildSettings(library=ConsolidationSettings(redundancy=RedundancySettings(chunks=3)))
     with Store.create(tmp_path / "m.l3r") as store:
         with store.transaction():
             for number, settings in enumerate((first, BuildSettings())):
                 store.sessions.complete(store.sessions.add("walk", str(number), settings.as_plain(), 3))
-        assert settings_of(store, None).whole_chunks == 3
+        assert settings_of(store, None).redundancy.chunks == 3
         assert [session_settings(s) for s in store.sessions.all()] == [first, BuildSettings()]
 
 

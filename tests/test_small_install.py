@@ -58,4 +58,4 @@ def test_asking_takes_none_of_the_extras(words: tuple[str, ...], memory: str) ->
 def test_what_is_missing_is_named_with_its_extra(words: tuple[str, ...], extra: str, memory: str) -> None:
     said = run(*(word.format(memory) for word in words))
     assert said.returncode == 2 and said.stderr.count("\n") == 1
-    assert f"pip install 'list3r[{extra}]'" in said.stderr
+    assert f"pip install '.[{extra}]'" in said.stderr

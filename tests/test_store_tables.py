@@ -13,14 +13,12 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
 from list3r.memory.maintenance import edits
 from list3r.memory.records import ChangeEvent, DetectedLabel, Votes
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.file import connected
 from list3r.memory.store.rows.json_values import array_scalar, typed
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.library import Anchor
 
 Make = Callable[..., Path]
 CUP = Votes(0.5, {"cup": (4.0, 16.0)}, 4.0)
@@ -58,18 +56,6 @@ def test_the_label_of_a_detector_goes_with_its_instance(make_memory: Make) -> No
             store.instances.drop(4, None)
         assert store.detected_labels.all() == {3: replace(label, label="mug")}
         assert store.verify() == []
-
-
-def test_all_anchors_come_once_and_in_order_though_they_are_written_meanwhile(tmp_path: Path) -> None:
-    with Store.create(tmp_path / "m.l3r") as store:
-        with store.transaction():
-            store.library.anchors.put({n: Anchor(n % 7, Sim3.identity()) for n in range(2500, 0, -1)})
-            told = []
-            for some in store.library.anchors.all():
-                told.append(list(some))
-                store.library.anchors.put({n: Anchor(a.chunk_id + 1, a.S_exact_settled) for n, a in some.items()})
-        assert len(told) == 3 and [n for some in told for n in some] == list(range(1, 2501))
-        assert all(a.chunk_id == n % 7 + 1 for some in store.library.anchors.all() for n, a in some.items())
 
 
 def test_a_fact_is_what_was_written_last_and_none_forgets_it(make_memory: Make) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 
 import list3r
 from list3r.cli.app import run
+from list3r.memory.errors import List3rError
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.records import Relation
@@ -25,8 +27,11 @@ from tests.conftest import small_picture, write_small_room
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together
 
 pytest.importorskip("viser")
+import msgspec
+import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from list3r.viewer.app import Viewer, ViewerSettings
 from list3r.viewer.box_lines import thin_lines
@@ -195,6 +200,10 @@ def test_any_code_gives_some_view(code: str) -> None:
 def test_what_makes_no_sense_in_a_code_is_as_usual() -> None:
     import base64
 
+    deep = base64.urlsafe_b64encode(b"[" * 1400).decode()
+    assert ViewState.decode(deep) == ViewState() == ViewState.decode("")
+    far = base64.urlsafe_b64encode(b'{"session": -1, "selected": 99999999999999999999}').decode()
+    assert ViewState.decode(far) == ViewState()
     code = base64.urlsafe_b64encode(b'{"colors": "loud", "selected": "x", "dark": true, "what": [1, 2]}').decode()
     assert ViewState.decode(code) == ViewState(dark=True)
 
@@ -212,12 +221,90 @@ def viewer(room: Path) -> Iterator[Viewer]:
 
 def test_pages_of_other_sites_are_not_answered(viewer: Viewer) -> None:
     address = viewer.address.replace("http", "ws")
-    for origin in ("https://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null"):
+    port = viewer.server.get_port()
+    others = (
+        f"http://127.0.0.1:{port - 1}",
+        "http://127.0.0.1",
+        f"http://localhost:{port}",
+        f"https://127.0.0.1:{port}",
+    )
+    for origin in ("https://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null", *others):
         with pytest.raises(InvalidStatus) as refused:
             connect(address, origin=origin)
         assert refused.value.response.status_code == 403
     with pytest.raises(InvalidStatus):
         connect(address)
+    with pytest.raises(InvalidStatus):
+        connect(address.replace("127.0.0.1", "localhost"), origin=Origin(f"http://localhost:{port}"))
+    connect(address, origin=Origin(viewer.address)).close()
+
+
+def test_another_name_of_the_host_is_told_the_right_one(viewer: Viewer) -> None:
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(viewer.address.replace("127.0.0.1", "localhost"))
+    assert refused.value.code == 403
+    assert f"answers at {viewer.address} only" in refused.value.read().decode()
+
+
+def open_page(viewer: Viewer, code: str | None, **headers: str) -> None:
+    """Open a page as a browser does, with a link where there is a code, until the viewer has taken it in."""
+    link(viewer, code or "", **headers)
+    before, said = set(viewer._pages), dict.fromkeys(("wxyz", "position", "look_at", "up_direction"), (0.0, 0.0, 1.0))
+    camera = {"type": "ViewerCameraMessage", **said, "wxyz": (1.0, 0.0, 0.0, 0.0), "fov": 1.0, "near": 0.1, "far": 9.0}
+    version = Subprotocol(f"viser-v{viser.__version__}")
+    with connect(viewer.address.replace("http", "ws"), origin=Origin(viewer.address), subprotocols=[version]) as page:
+        page.send(msgspec.msgpack.encode(camera | {"image_height": 90, "image_width": 90}))
+        deadline = time.monotonic() + 60
+        while not set(viewer._pages) - before:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+
+def link(viewer: Viewer, code: str, **headers: str) -> None:
+    asked = urllib.request.Request(f"{viewer.address}/?view={code}", headers={"Sec-Fetch-Dest": "document", **headers})
+    with urllib.request.urlopen(asked) as answer:
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors http://127.0.0.1:*"
+
+
+def test_a_link_to_what_is_not_there_is_told_and_breaks_nothing(two_sessions: Path) -> None:
+    with list3r.open(two_sessions) as memory:
+        viewer = Viewer(memory, ViewerSettings(0))
+        try:
+            open_page(viewer, ViewState(session=0, selected=12345, dark=True).encode())
+            assert viewer.state == ViewState(dark=True)
+            assert viewer.panel._message.content == (
+                "This memory has no session 0, which the link names. There is no thing 12345, which the link names."
+            )
+            viewer.reload()
+            open_page(viewer, ViewState(session=1).encode())
+            assert viewer.state == ViewState(session=1) and viewer.panel._message.content == ""
+            for session in (99, 0, -1):
+                with pytest.raises(List3rError):
+                    viewer.show(session=session)
+                assert viewer.state == ViewState(session=1)
+            viewer.show(boxes=False)
+            viewer.reload()
+            assert viewer.state == ViewState(session=1, boxes=False)
+        finally:
+            viewer.stop()
+
+
+def test_of_many_links_the_last_one_is_shown_and_that_is_told(viewer: Viewer) -> None:
+    for n in range(200):
+        link(viewer, ViewState(selected=n).encode())
+    open_page(viewer, ViewState(selected=MUG).encode())
+    assert viewer.state.selected == MUG
+    assert "Several links were opened at once" in viewer.panel._message.content
+    viewer.select(None)
+    open_page(viewer, None)
+    assert viewer.state.selected is None
+
+
+def test_a_picture_of_another_page_is_no_link(viewer: Viewer) -> None:
+    for what in ("image", "script", "empty"):
+        link(viewer, ViewState(selected=CHAIR).encode(), **{"Sec-Fetch-Dest": what})
+    open_page(viewer, None)
+    assert viewer.state.selected is None
 
 
 def test_search_select_and_measure_without_a_page(viewer: Viewer) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from list3r.memory.errors import List3rError, OptionError
 from list3r.pipeline.workers import OrderedPool, WorkerError
+from tests.program import with_signals
 
 ENDS_WITHIN_S = 20.0
 """A process ends within a second; a machine that is busy with other things takes longer to notice."""
@@ -171,7 +172,9 @@ def run_script(folder: Path, text: str) -> subprocess.Popen[str]:
     script.write_text(text, encoding="utf-8")
     root = str(Path(__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
-    return subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=environment)
+    return subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=with_signals
+    )
 
 
 def test_a_script_without_a_guard_is_run_once(tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ class _Track:
 
 
 def unseen_home_errors() -> InstanceErrorSettings:
-    """Return the errors of discovery in homes that it never saw (docs/decisions/0080): measured there are recall 0.61
-    to 0.84, precision 0.35 to 0.85 by masks, 0.3 merged pairs and 0.04 duplicates for each thing.
+    """Return the errors of discovery in homes that it never saw (research/discovery 0080): measured there are recall
+    0.61 to 0.84, precision 0.35 to 0.85 by masks, 0.3 merged pairs and 0.04 duplicates for each thing.
     """
     return InstanceErrorSettings(
         merge_share=0.2,

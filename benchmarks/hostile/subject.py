@@ -22,7 +22,6 @@ from list3r.memory.records import (
     Votes,
 )
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.library import RedundantInstance
 from tests.conftest import (
     SMALL_ROOM,
     box_points,
@@ -80,9 +79,6 @@ def _tell_changes(store: Store) -> None:
         for n, (kind, before, after) in zip(ids, kinds, strict=False)
     )
     store.votes.put(1, "net", {2: Votes(0.5, {"cup": (4.0, 16.0)}, 4.0)})
-    store.library.redundant.put(
-        2, [RedundantInstance((2, 0), (1, 0), np.arange(FRAMES, dtype=np.int32))], all_of_it=False
-    )
     store.detected_labels.replace({ids[2]: DetectedLabel("cup", 0.9, 3.0, "net")})
 
 

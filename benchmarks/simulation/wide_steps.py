@@ -40,7 +40,8 @@ class WideStepWalk(WalkSettings):
     """or turned so far, whichever comes first."""
     clear_m: float = 0.3
     """The camera is not held nearer than this to what stands in the way, where the body is not nearer itself. Without
-    it and with steps of 6 degrees walks are those of decision 0074, which touch door frames (decision 0075)."""
+    it and with steps of 6 degrees walks are those of research/colour-video 0074, which touch door frames
+    (research/colour-video 0075)."""
 
     def world(self) -> SimulatedWorld:
         """The world of the building."""

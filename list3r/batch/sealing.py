@@ -36,7 +36,8 @@ def seal(memory: Path, sealed: Path, keys: Sequence[str], source: str) -> str:
         with contextlib.closing(connected(memory, "ro")) as database:
             database.execute("VACUUM INTO ?", (str(part),))
         with contextlib.closing(connected(part, "rw")) as database:
-            database.execute("PRAGMA journal_mode=WAL").fetchall()
+            for setting in ("journal_mode=WAL", "secure_delete=ON"):
+                database.execute(f"PRAGMA {setting}").fetchall()
             database.sum_again()
             fold_in(database, 0)
     except apsw.Error as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,15 @@ from typing import Any
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.errors import MemoryFileError, OptionError, SourceError
 from list3r.memory.store.file import rename_exclusively
+
+_NAME = re.compile(r"[\w][\w.-]{0,99}")
+
+
+def checked_name(name: str) -> str:
+    """Return the name of a memory, of which paths are made. Raises `OptionError` for one that could lead elsewhere."""
+    if not _NAME.fullmatch(name):
+        raise OptionError(f"{name!r} cannot be the name of a memory; use letters, digits, - and _")
+    return name
 
 
 def is_remote(where: str) -> bool:

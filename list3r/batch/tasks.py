@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from list3r.batch.storage import children, is_remote, joined, listing, read_text
+from list3r.batch.storage import checked_name, children, is_remote, joined, listing, read_text
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import List3rError, OptionError
 from list3r.memory.unpacking import parse_json
@@ -18,7 +17,6 @@ from list3r.pipeline.request import BuildRequest, RunOptions
 
 _VIDEOS = frozenset((".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".bag", ".mcap", ".r3d"))
 """Endings of files that a folder of videos is searched for."""
-_NAME = re.compile(r"[\w][\w.-]{0,99}")
 
 
 @dataclass(frozen=True)
@@ -113,9 +111,8 @@ def _object(text: str, at: str) -> dict[str, Any]:
 def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
     source = str(fields.pop("source"))
     memory = str(fields.pop("memory", None) or PurePosixPath(source).stem)
-    if not _NAME.fullmatch(memory):
-        raise OptionError(f"{at}: {memory!r} cannot be the name of a memory; use letters, digits, - and _")
     try:
+        checked_name(memory)
         options = asked.options_of(fields)
     except TypeError as error:
         unknown = next((name for name in fields if repr(name) in str(error)), ", ".join(fields))

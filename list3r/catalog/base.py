@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
+from list3r.catalog.records import CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
 
 MOST_RANKED = 2_000
 """Most instances that match some words and are ranked; of more, any of them."""
@@ -73,6 +72,10 @@ class Backend(Protocol):
         """Return the names of spaces that hold vectors."""
         ...
 
+    def dimension(self, space: str) -> int | None:
+        """Return how many numbers the vectors of a space have; None where it has none."""
+        ...
+
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
         """Return the vector of an instance. Shape (D,)."""
         ...
@@ -80,7 +83,7 @@ class Backend(Protocol):
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogThing, float]]:
-        """Return the k whose vectors are most like one, with the cosine, the most alike first."""
+        """Return the k whose vectors are most like one of length 1, with the cosine, the most alike first."""
         ...
 
     def alive(self) -> bool:
@@ -90,26 +93,6 @@ class Backend(Protocol):
     def close(self) -> None:
         """Let the database go."""
         ...
-
-
-def open_backend(url: str, connections: int = 1, *, make: bool = True) -> Backend:
-    """Return the database of a URL: postgresql://host/name, or a path or sqlite:///path for the embedded one.
-
-    Without `make` a file that is not there is refused. Raises `CatalogError`.
-    """
-    kind, separator, rest = url.partition("://")
-    if not separator or kind == "sqlite":
-        from list3r.catalog.sqlite import SqliteBackend
-
-        path = rest.removeprefix("/") if separator else url
-        if not make and not Path(path).exists():
-            raise CatalogError(f"{path} does not exist; `list3r catalog add FILE... --catalog {path}` makes it")
-        return SqliteBackend(path)
-    if kind in ("postgresql", "postgres"):
-        from list3r.catalog.postgres import PostgresBackend
-
-        return PostgresBackend(url, connections)
-    raise CatalogError(f"{kind}:// is not a catalogue; give postgresql://host/name, or a file such as catalog.sqlite")
 
 
 def wanted_sql(

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.batch.storage import Output, is_remote
-from list3r.catalog.base import MOST_RANKED, Backend, open_backend
+from list3r.catalog.backends import open_backend
+from list3r.catalog.base import MOST_RANKED, Backend
 from list3r.catalog.reading import printable, read_content
 from list3r.catalog.records import (
     CatalogAnswers,
@@ -26,7 +27,8 @@ from list3r.catalog.records import (
     UnknownMemoryError,
     Wanted,
 )
-from list3r.memory.errors import OptionError, UnknownIdError, naming_extras
+from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError, naming_extras
+from list3r.memory.search.vectors import unit_query
 from list3r.queries.finding.grammar import Phrase, parse
 from list3r.queries.finding.words import STRUCTURE, wanted_words
 from list3r.queries.match import checked_count, checked_length, checked_point
@@ -80,7 +82,7 @@ class Catalog:
         """Take a memory file into the catalogue, in place of what has its name; its entry, with the new revision.
 
         With a `store`, a folder or URL, the file is copied there under a name that no other file ever gets, and the
-        catalogue names the copy. Raises `CatalogError`, `MemoryFileError`.
+        catalogue names the copy. Raises `OptionError` for what cannot be a name, `CatalogError`, `MemoryFileError`.
         """
         content = read_content(str(path), name)
         if store is not None:
@@ -95,8 +97,12 @@ class Catalog:
         return self._backend.put(content)
 
     def again(self, path: str, name: str | None = None) -> MemoryEntry:
-        """Write a memory again from its file; its revision stays where the file is the same."""
-        return self._backend.put(read_content(path, name), again=True)
+        """Write a memory again from its file; its revision stays where the file is the same. Raises as `add` does."""
+        try:
+            content = read_content(path, name)
+        except OptionError as error:
+            raise OptionError(f"{error}; if the catalogue has it, `list3r catalog remove` forgets it") from None
+        return self._backend.put(content, again=True)
 
     def loading(self, count: int) -> AbstractContextManager[None]:
         """Add this many memories meanwhile: if the catalogue has fewer, its indices are built again at the end."""
@@ -208,6 +214,8 @@ class Catalog:
     ) -> CatalogAnswers:
         """Find things that look like an instance of a memory, or like a vector of a space: over all memories, or in
         that one alone where not `anywhere`.
+
+        Raises `OptionError` for arguments that make no sense, `SpaceMismatchError` for vectors of another space.
         """
         k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
         if (instance_id is None) == (vector is None):
@@ -219,12 +227,12 @@ class Catalog:
             self._known(memory, instance_id)
             asked = self._backend.vector(memory, instance_id, chosen)
             if asked is None:
-                raise CatalogError(f"{memory} has no vector for #{instance_id} in {chosen}; `list3r embed` makes one")
-        else:
-            asked = np.asarray(vector, np.float32)
-            if asked.ndim != 1 or not np.isfinite(asked).all() or not np.linalg.norm(asked):
-                raise OptionError("the vector to compare with must be a row of finite numbers, not all zero")
-        found = self._backend.alike(None if anywhere else memory, chosen, asked, k + (instance_id is not None), filters)
+                raise OptionError(f"{memory} has no vector for #{instance_id} in {chosen}; `list3r embed` makes one")
+            vector = asked
+        assert vector is not None
+        unit = unit_query(vector)
+        self._check_space(chosen, len(unit))
+        found = self._backend.alike(None if anywhere else memory, chosen, unit, k + (instance_id is not None), filters)
         others = [(t, c) for t, c in found if (t.memory, t.id) != (memory, instance_id)][:k]
         rows = ((t, c, None, f"cosine {c:.3f} in {chosen}") for t, c in others)
         return self._answers(rows, [] if anywhere else entries)
@@ -294,6 +302,15 @@ class Catalog:
             what = memory or "the catalogue"
             raise OptionError(f"{what} has vectors of {len(spaces)} spaces; {which}")
         return spaces[0]
+
+    def _check_space(self, space: str, numbers: int) -> None:
+        """Raise `SpaceMismatchError` unless the catalogue has vectors of so many numbers in a space."""
+        held = self._backend.dimension(space)
+        if held is None:
+            known = ", ".join(self._backend.spaces(None)) or "none"
+            raise SpaceMismatchError(f"the catalogue has no vectors of {space}; it has: {known}")
+        if held != numbers:
+            raise SpaceMismatchError(f"a vector of {numbers} numbers does not belong to {space}, which has {held}")
 
     def _by_name(
         self, known: Iterable[MemoryEntry], names: Iterable[str]

@@ -26,7 +26,8 @@ from list3r.catalog.records import (
     SpaceVectors,
     Wanted,
 )
-from list3r.catalog.sqlite import thing_of, unit_vectors
+from list3r.catalog.sqlite import check_dimension, thing_of
+from list3r.memory.search.vectors import unit
 
 _ENTRY_FIELDS = fields(MemoryEntry)
 _ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)
@@ -38,7 +39,7 @@ _MOST_ALIKE = 10_000
 """Vectors that are looked at because few of the most alike pass the filters."""
 _WIDE, _LISTS_OF_WIDE = 128, 20
 """Vectors with more numbers than the first are searched in as many lists as the second says, instead of 40: they take
-longer to compare, and fewer lists find as many. docs/decisions/0141-lists-of-vectors.md."""
+longer to compare, and fewer lists find as many. research/storage 0141."""
 _WRITTEN = "written"
 _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""
@@ -100,10 +101,7 @@ class PostgresBackend:
                 statement = "INSERT INTO space (name, dimension) VALUES (%s, %s) RETURNING space_id, dimension"
                 known = _first(connection.execute(statement, (held.space, dimension)))
                 connection.execute(vector_table(known[0], dimension).encode())
-            if known[1] != dimension:
-                raise CatalogError(
-                    f"vectors of {dimension} numbers do not belong to {held.space}, which has {known[1]}"
-                )
+            check_dimension(held, known[1])
             out.append((int(known[0]), held))
         return out
 
@@ -230,15 +228,24 @@ class PostgresBackend:
 
     def spaces(self, memory: str | None) -> list[str]:
         """Return the names of spaces that hold vectors. Raises `CatalogError` where the server has no pgvector."""
-        if not self.has_vectors:
-            raise CatalogError(
-                f"the server at {self._where} has no pgvector; install it and run `list3r catalog rebuild`"
-            )
+        self._need_vectors()
         known = self._rows("SELECT name, space_id FROM space ORDER BY name", ())
         if memory is None:
             return [str(name) for name, _ in known]
         query, number = "SELECT EXISTS (SELECT 1 FROM vector_{} WHERE memory_id = ?)", self._number(memory)
         return [str(name) for name, n in known if self._rows(query.format(int(n)), (number,))[0][0]]
+
+    def dimension(self, space: str) -> int | None:
+        """Return how many numbers the vectors of a space have. Raises `CatalogError` where there is no pgvector."""
+        self._need_vectors()
+        rows = self._rows("SELECT dimension FROM space WHERE name = ?", (space,))
+        return int(rows[0][0]) if rows else None
+
+    def _need_vectors(self) -> None:
+        if not self.has_vectors:
+            raise CatalogError(
+                f"the server at {self._where} has no pgvector; install it and run `list3r catalog rebuild`"
+            )
 
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
         """Return the vector of an instance."""
@@ -445,7 +452,7 @@ def _copy_vectors(connection: psycopg.Connection[Any], memory: int, space: int, 
     lengths = [("fields", ">i2"), ("l0", ">i4"), ("memory", ">i4"), ("l1", ">i4"), ("id", ">i8"), ("l2", ">i4")]
     rows = np.zeros(count, np.dtype([*lengths, ("dim", ">i2"), ("unused", ">i2"), ("v", ">f2", (dimension,))]))
     rows["fields"], rows["l0"], rows["l1"], rows["l2"] = 3, 4, 8, 4 + 2 * dimension
-    rows["memory"], rows["id"], rows["dim"], rows["v"] = memory, held.ids, dimension, unit_vectors(held.vectors)
+    rows["memory"], rows["id"], rows["dim"], rows["v"] = memory, held.ids, dimension, unit(held.vectors)
     with connection.cursor() as cursor, cursor.copy(f"COPY vector_{space} FROM STDIN (FORMAT binary)") as copy:
         copy.write(b"PGCOPY\n\xff\r\n\0" + struct.pack(">ii", 0, 0) + rows.tobytes() + struct.pack(">h", -1))
 
@@ -457,7 +464,7 @@ def _corner(point: Sequence[float]) -> str:
 
 def _halfvec(vector: NDArray[np.float32]) -> str:
     """Return a vector of unit length as pgvector reads it."""
-    return "[" + ",".join(f"{x:.5g}" for x in unit_vectors(vector[None])[0].tolist()) + "]"
+    return "[" + ",".join(f"{x:.5g}" for x in vector.tolist()) + "]"
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:

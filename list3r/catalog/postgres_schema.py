@@ -9,7 +9,7 @@ FEWEST_INDEXED = 20_000
 """Vectors of a space from which on they have an index; fewer are all compared in a few milliseconds."""
 _A_LIST, _MOST_LISTS = 500, 2000
 """Vectors of a list of the index, as long as there are not more lists than that: learning takes the square of them, in
-time and memory (0.8 GB). docs/decisions/0141-lists-of-vectors.md."""
+time and memory (0.8 GB). research/storage 0141."""
 
 
 def _partitioned(table: str) -> str:

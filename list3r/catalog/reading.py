@@ -5,10 +5,12 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from list3r.batch.storage import fetched, is_remote
+from list3r.batch.storage import checked_name, fetched, is_remote
 from list3r.catalog.records import CatalogError, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.memory.description.words import vocabulary
+from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
+from list3r.memory.store.beside import has_foreign_log
 from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store
 
@@ -16,7 +18,8 @@ from list3r.memory.store.store import Store
 def read_content(path: str, name: str | None = None) -> MemoryContent:
     """Return the content of a memory file, under its own name unless another is given.
 
-    Raises `MemoryFileError` for what is no memory, `CatalogError` for one that is being written.
+    Raises `OptionError` for what cannot be a name, `MemoryFileError` for what is no memory, `CatalogError` for one that
+    is being written.
     """
     if path != printable(path):
         raise CatalogError(f"{printable(path)} is not valid UTF-8, which a catalogue needs; rename the file or folder")
@@ -32,11 +35,11 @@ def read_content(path: str, name: str | None = None) -> MemoryContent:
 
 def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryContent:
     log = local.with_name(f"{local.name}-wal")
-    if log.exists() and log.stat().st_size:
+    if log.exists() and log.stat().st_size and not has_foreign_log(local):
         raise CatalogError(
             f"{path} is being written; wait for that to end. If nothing writes it, `list3r repair {path}` completes it"
         )
-    name = printable(name or Path(path).stem)
+    name = _own_name(path) if name is None else checked_name(name)
     with Store.open(local) as store, store.snapshot():
         things = [_thing(name, i) for i in store.instances.all()]
         relations = [
@@ -56,6 +59,13 @@ def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryC
             len(store.sessions.all()),
         )
     return MemoryContent(entry, things, relations, spaces)
+
+
+def _own_name(path: str) -> str:
+    try:
+        return checked_name(Path(path).stem)
+    except OptionError as error:
+        raise OptionError(f"{path}: {error}; rename the file, or add it under another name") from None
 
 
 def _thing(memory: str, i: Instance) -> CatalogThing:

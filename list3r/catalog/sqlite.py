@@ -14,8 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
-from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
+from list3r.catalog.records import (
+    CatalogError,
+    CatalogFilters,
+    CatalogThing,
+    MemoryContent,
+    MemoryEntry,
+    SpaceVectors,
+    Wanted,
+)
 from list3r.memory.geometry import OrientedBox
+from list3r.memory.search.vectors import unit
 
 _APPLICATION_ID = 0x4C334331
 """ASCII "L3C1"."""
@@ -108,7 +117,8 @@ class SqliteBackend:
             "INSERT INTO relation VALUES (?, ?, ?, ?, ?, ?)", ((memory, *r) for r in content.relations)
         )
         for space in content.spaces:
-            held = zip(space.ids.tolist(), unit_vectors(space.vectors).astype("<f2"), strict=True)
+            check_dimension(space, self.dimension(space.space))
+            held = zip(space.ids.tolist(), unit(space.vectors).astype("<f2"), strict=True)
             database.executemany(
                 "INSERT INTO vector VALUES (?, ?, ?, ?)", ((space.space, memory, n, v.tobytes()) for n, v in held)
             )
@@ -250,6 +260,11 @@ class SqliteBackend:
         where, values = ("", ()) if memory is None else (f"WHERE {_OF_MEMORY.replace('i.', '')}", (memory,))
         return [str(s) for (s,) in self._rows(f"SELECT DISTINCT space FROM vector {where} ORDER BY space", values)]
 
+    def dimension(self, space: str) -> int | None:
+        """Return how many numbers the vectors of a space have."""
+        rows = self._rows("SELECT length(v) FROM vector WHERE space = ? LIMIT 1", (space,))
+        return int(rows[0][0]) // 2 if rows else None
+
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
         """Return the vector of an instance."""
         query = f"SELECT v FROM vector i WHERE space = ? AND {_OF_MEMORY} AND id = ?"
@@ -264,19 +279,14 @@ class SqliteBackend:
         only, given = ("", ()) if memory is None else (f" AND {_OF_MEMORY}", (memory,))
         query = (
             "SELECT i.number, v.v FROM vector v JOIN instance i ON i.memory_id = v.memory_id AND i.id = v.id "
-            f"WHERE v.space = ? AND {passing}{only}"
+            f"WHERE v.space = ? AND length(v.v) = ? AND {passing}{only}"
         )
         best = np.zeros((0, 2))
-        unit = unit_vectors(vector[None])[0]
         with self._reading():
-            rows = self._database.execute(query, (space, *values, *given))
+            rows = self._database.execute(query, (space, 2 * len(vector), *values, *given))
             while some := rows.fetchmany(_BATCH):
                 held = np.frombuffer(b"".join(v for _, v in some), "<f2").reshape(len(some), -1).astype(np.float32)
-                if held.shape[1] != len(unit):
-                    raise CatalogError(
-                        f"a vector of {len(unit)} numbers does not belong to {space}, which has {held.shape[1]}"
-                    )
-                both = np.column_stack([held @ unit, [n for n, _ in some]])
+                both = np.column_stack([held @ vector, [n for n, _ in some]])
                 best = np.concatenate([best, both])
                 best = best[np.lexsort((best[:, 1], -best[:, 0]))[:k]]
             query = f"SELECT {_THING} {_FROM} WHERE i.number = ?"
@@ -363,7 +373,8 @@ def box_of(numbers: NDArray[np.float64]) -> OrientedBox:
     return OrientedBox(numbers[:3], numbers[3:6], numbers[6:].reshape(3, 3))
 
 
-def unit_vectors(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return vectors of length one. Shape (N, D)."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float32)
+def check_dimension(held: SpaceVectors, known: int | None) -> None:
+    """Raise `CatalogError` for vectors of another dimension than a space is known to have."""
+    numbers = held.vectors.shape[1]
+    if known is not None and numbers != known:
+        raise CatalogError(f"vectors of {numbers} numbers do not belong to {held.space}, which has {known}")

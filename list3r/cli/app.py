@@ -11,7 +11,8 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import FrameType, ModuleType
 from typing import Any
@@ -22,7 +23,7 @@ import typer.core
 from list3r.cli.answer import print_error, wants_json
 from list3r.cli.terminal import OutputError, flush, mute, note, prepare_streams, say
 from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.errors import List3rError, naming_extras
+from list3r.memory.errors import List3rError, MemoryFileWarning, naming_extras
 
 MODULES: dict[str, tuple[str, ...]] = {
     "build.commands": ("inspect", "build", "demo"),
@@ -143,6 +144,23 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
 
 def run(arguments: list[str]) -> int:
     """Run one command; its exit status. What failed is said in one line, with `--json` in an answer as well."""
+    with warnings.catch_warnings():
+        warnings.showwarning = functools.partial(_show_warning, warnings.showwarning)
+        warnings.simplefilter("default", MemoryFileWarning)
+        return _run(arguments)
+
+
+def _show_warning(
+    others: Callable[..., None], message: Warning | str, category: type[Warning], *where: Any, **more: Any
+) -> None:
+    """Say what is to be known of a memory in one line; show any other warning as ever."""
+    if issubclass(category, MemoryFileWarning):
+        note(f"note: {message}")
+    else:
+        others(message, category, *where, **more)
+
+
+def _run(arguments: list[str]) -> int:
     failures = _Failures(wants_json(arguments))
     try:
         if arguments and arguments[0] in _BUILDING:

@@ -6,17 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from list3r.cli.terminal import draws
-
-
-class ProgressBar:
-    """A bar that draws nothing: work says how far it is whether or not somebody looks."""
-
-    def stage(self, name: str, unit: str = "") -> None:
-        """Begin another stage of the work, counted in `unit`; nothing of it is done yet."""
-
-    def show(self, done: int, total: int) -> None:
-        """Move the bar to where the work is."""
+from list3r.cli.terminal import ProgressBar, draws
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from list3r.cli.bar import ProgressBar
+from list3r.cli.terminal import ProgressBar
 
 _NUMBERS = re.compile(r"[\d\s.,:+-]*|nan|-?inf")
 _GAP = 2

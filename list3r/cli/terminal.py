@@ -70,9 +70,21 @@ def prepare_streams() -> None:
             os.fstat(descriptor)
         except OSError:
             os.dup2(os.open(os.devnull, mode), descriptor)
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123
         elif hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
+
+
+class ProgressBar:
+    """A bar that draws nothing: work says how far it is whether or not somebody looks."""
+
+    def stage(self, name: str, unit: str = "") -> None:
+        """Begin another stage of the work, counted in `unit`; nothing of it is done yet."""
+
+    def show(self, done: int, total: int) -> None:
+        """Move the bar to where the work is."""

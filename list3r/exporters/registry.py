@@ -88,7 +88,7 @@ FORMATS: dict[str, Format] = {
     "graphml": Format("graphs", "write_graphml", (".graphml",), "graphs of relations and of merges"),
     "node-link": Format("graphs", "write_node_link", (".json",), "the same graphs as JSON", True),
     "rerun": Format("rerun_log", "write_rerun", (".rrd",), "recording for the Rerun viewer", package="rerun"),
-    "plan": Format("plan.picture", "write_plan", (".png", ".svg"), "plan view of the rooms as a picture"),
+    "plan": Format("plan.drawing", "write_plan", (".png", ".svg"), "plan view of the rooms as a picture"),
     "report": Format("report.page", "write_report", (".html",), "a page to read and search", of_memory=True),
     "simready": Format(
         "simready.assembly",

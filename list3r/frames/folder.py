@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,8 @@ class FolderSource(Reader):
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
-        self._info = self._describe(root, (*notes, *self._doubts()))
+        self._empty: dict[int, str] = {}
+        self._info = self._describe(root, notes)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
@@ -89,11 +91,15 @@ class FolderSource(Reader):
             yield self._read(self._number(position))
 
     def read_some(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but frames at positions that are no multiple of `step` are read when they are looked at."""
+        """As `read`, but frames at positions that are no multiple of `step` are read when they are looked at.
+
+        Of those whose files are known to be empty or missing it is said at once.
+        """
         for position in range(len(self._chosen))[start:stop]:
             number = self._number(position)
-            if position % step:
-                file = self._layout.files[number]
+            file = self._layout.files[number]
+            lacking = number in self._empty or (self._has_depth and file.depth is None)
+            if position % step and not lacking:
                 yield LazyFrame(number, self._time_s(number, file), self._pose(file), partial(self._read, number))
             else:
                 yield self._read(number)
@@ -197,13 +203,22 @@ class FolderSource(Reader):
         return None if T_source_given is None else T_source_given @ self._T_posed_color
 
     def _probe(self, root: Path) -> tuple[tuple[int, int], tuple[int, int] | None]:
-        """Image sizes of the first frame that decodes, among the first and some spread over the source."""
-        count = len(self._chosen)
-        spread = np.linspace(0, count - 1, _PROBES).astype(int).tolist()
-        tried = dict.fromkeys([*range(min(3, count)), *spread])
-        paths = [self._layout.files[int(self._chosen.starts[k])] for k in tried]
+        """Image sizes of the first frame that decodes, among the first and some spread over the source.
+
+        Those come first whose picture has the size that most of the ones spread have. Of a stretch of a source in which
+        none decodes the others tell.
+        """
+        files, count = self._layout.files, len(self._chosen)
+        spread = set(np.linspace(0, count - 1, _PROBES).astype(int).tolist())
+        tried = sorted({*range(min(3, count)), *spread})
+        paths = [files[int(self._chosen.starts[k])] for k in tried]
+        sizes = [_size_of(file) for file in paths]
+        known = Counter(size for k, size in zip(tried, sizes, strict=True) if size and k in spread)
+        usual = known.most_common(1)[0][0] if known else ()
+        first = [file for _, file in sorted(zip(sizes, paths, strict=True), key=lambda pair: pair[0] != usual)]
+        others = (files[k] for k in range(0, len(files), -(-len(files) // _PROBES)))
         reason = ""
-        for file in _usual_size_first(paths):
+        for file in chain(first, others if count < len(files) else ()):
             try:
                 color = read_color(file.color, upright=self._layout.upright_tags)
                 self._first_picture = file.color
@@ -231,13 +246,24 @@ class FolderSource(Reader):
         )
 
     def _file_doubts(self) -> tuple[str, ...]:
-        """Of files spread over the source, those that cannot be read; steps that are not even miss no pattern."""
-        files = self._layout.files
-        some = [files[int(k)] for k in np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round())]
+        """Return how many files are empty or missing, and of others spread over the source, those that cannot be read.
+
+        Steps that are not even miss no pattern.
+        """
+        files, empty = self._layout.files, self._empty
+        out = []
+        if empty:
+            first, reason = next(iter(empty.items()))
+            rest = ", and those of all frames behind it" if len(empty) == len(files) - first > 1 else ""
+            out.append(
+                f"{len(empty)} of {len(files)} frames cannot be used: the first is frame {first} ({reason}){rest}"
+            )
+        tried = np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round()).astype(int).tolist()
+        some = [files[k] for k in tried if k not in empty]
         faults = [found for f in some if (found := fault_of(f.color) or (fault_of(f.depth) if f.depth else None))]
-        if not faults:
-            return ()
-        return (f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]}); is the copy complete?",)
+        if faults:
+            out.append(f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]})")
+        return tuple(f"{found}; is the copy complete?" for found in out)
 
     def _scale_doubts(self) -> tuple[str, ...]:
         """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
@@ -303,7 +329,7 @@ class FolderSource(Reader):
         posed, deep = len(files.that_hold(POSE_FILE | POSE)), len(files.that_hold(DEPTH))
         return (
             *((without_pose(total - posed, total),) if 0 < posed < total else ()),
-            *((without_depth(total - deep, total),) if self._has_depth and deep < total else ()),
+            *((without_depth(files.that_hold(DEPTH), total),) if self._has_depth and deep < total else ()),
         )
 
     def _time_doubts(self) -> tuple[str, ...]:
@@ -317,6 +343,8 @@ class FolderSource(Reader):
 
     def _describe(self, root: Path, notes: tuple[str, ...]) -> SourceInfo:
         layout, rig = self._layout, self._rig
+        found = fingerprint(layout.kind, self._listing(root), self._options)
+        notes = (*notes, *self._doubts())
         guess, turns = self._camera_guess(), self._turns()
         missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
         if rig.color_size != rig.stored_size:
@@ -340,7 +368,7 @@ class FolderSource(Reader):
             has_depth=self._has_depth,
             has_poses=has_poses,
             scale_kind="metric" if self._has_depth else "relative",
-            fingerprint=fingerprint(layout.kind, _listing(layout.files, root), self._options),
+            fingerprint=found,
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
@@ -353,6 +381,19 @@ class FolderSource(Reader):
             z_up=turns is not None,
             poses_drift=layout.poses_drift,
         )
+
+    def _listing(self, root: Path) -> Iterator[tuple[str, int]]:
+        """Yield names and sizes of all files, and keep which frames have none to read."""
+        above = f"{root}{os.sep}"
+        for number, file in enumerate(self._layout.files):
+            for stored in (p for p in (file.color, file.depth, file.pose) if p is not None):
+                size = stored_size(stored)
+                if size <= 0 and stored is not file.pose:
+                    reason = f"{stored.name} is {'missing' if size else 'empty'}"
+                    self._empty.setdefault(number, reason)
+                isfile = isinstance(stored, Path)
+                name = str(stored).removeprefix(above).replace(os.sep, "/") if isfile else stored.name
+                yield name, size
 
     def _some_files(self) -> list[Stored | CodedArray | None]:
         """Return the files of the first frame, the last and one between."""
@@ -372,9 +413,11 @@ def without_pose(count: int, total: int) -> str:
     return f"{count} of {total} frames have no pose"
 
 
-def without_depth(count: int, total: int) -> str:
-    """That some frames have no depth image, for people."""
-    return f"{count} of {total} frames have no depth image and cannot be used"
+def without_depth(deep: Sequence[int] | NDArray[np.int64], total: int) -> str:
+    """That some frames have no depth image, for people; `deep` are the numbers of those that have, ascending."""
+    missing, ends = total - len(deep), int(deep[-1]) + 1 if len(deep) else 0
+    where = f" (all from frame {ends} on)" if missing == total - ends > 1 else ""
+    return f"{missing} of {total} frames have no depth image and cannot be used{where}"
 
 
 def centred_camera(focal: float, rig: Rig) -> Camera:
@@ -400,24 +443,12 @@ def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOp
     return found.hexdigest()[:32]
 
 
-def _usual_size_first(files: Sequence[FrameFile]) -> list[FrameFile]:
-    """Return the files in order, but those whose picture has not the size that most have behind the others."""
-    sizes = []
-    for file in files:
-        try:
-            sizes.append(read_gray(file.color, 8).shape)
-        except FrameError:
-            sizes.append(())
-    known = Counter(size for size in sizes if size)
-    usual = known.most_common(1)[0][0] if known else ()
-    return [files[k] for k in sorted(range(len(files)), key=lambda k: sizes[k] != usual)]
-
-
-def _listing(files: Iterable[FrameFile], root: Path) -> Iterator[tuple[str, int]]:
-    above = f"{root}{os.sep}"
-    for stored in (p for f in files for p in (f.color, f.depth, f.pose) if p is not None):
-        name = str(stored).removeprefix(above).replace(os.sep, "/") if isinstance(stored, Path) else stored.name
-        yield name, stored_size(stored)
+def _size_of(file: FrameFile) -> tuple[int, ...]:
+    """Return the size of a picture, an eighth of it; empty where it cannot be decoded."""
+    try:
+        return read_gray(file.color, 8).shape
+    except FrameError:
+        return ()
 
 
 def _median_known(raw: NDArray[Any]) -> float:

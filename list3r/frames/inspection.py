@@ -21,6 +21,8 @@ class SourceReport:
     calibration: DepthCalibration | None = None
     overlay: Path | None = None
     """The picture of depth edges over colour that was written."""
+    unusable: tuple[str, ...] = ()
+    """Frames that cannot be used, as far as a quick look tells: a build leaves them out."""
     wrong: tuple[str, ...] = ()
     """How poses, depth and camera contradict each other: a build that uses the poses is refused."""
 
@@ -46,6 +48,7 @@ class SourceReport:
             "fingerprint": info.fingerprint,
             "notes": list(info.notes),
             "missing": list(info.missing),
+            "unusable": list(self.unusable),
             "wrong": list(self.wrong),
         }
         if self.calibration is not None:
@@ -67,6 +70,7 @@ class SourceReport:
             f"vertical     {_vertical_text(info)}",
             *(f"note         {note}" for note in info.notes),
             *(f"missing      {what}" for what in info.missing),
+            *(f"unusable     {what}; build leaves such frames out" for what in self.unusable),
             *(f"wrong        {what}; build refuses such poses (--poses estimate needs none)" for what in self.wrong),
             *([] if self.calibration is None else _calibration_lines(self.calibration)),
             *([] if self.overlay is None else [f"overlay      {self.overlay}"]),

@@ -42,7 +42,8 @@ class SegmentSettings:
     """How the fused chunk is cut into things."""
 
     voxel_m: float = 0.016
-    """Grain of the chunk's cloud: coarser than what the networks learned from, and better by it (decision 0176)."""
+    """Grain of the chunk's cloud: coarser than what the networks learned from, and better by it (research/discovery
+    0176)."""
     computed_voxel_m: float = 0.01
     """The same where no sensor measured depth: larger voxels lose things there."""
 

@@ -146,6 +146,10 @@ class Constraints:
     def __bool__(self) -> bool:
         return bool(self.touched or self.deletions)
 
+    def speaks_of(self, key: Key) -> bool:
+        """Return whether somebody said anything of a local instance."""
+        return key in self.touched or any(key in d.keys for d in self.deletions)
+
     @staticmethod
     def of(edits: Sequence[Edit]) -> Constraints:
         """Return what edits (undone ones among them) come to."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class List3rError(Exception):
@@ -24,6 +26,10 @@ class OptionError(List3rError):
 
 class MemoryFileError(List3rError):
     """A memory file that is absent, foreign, damaged, locked, or of a newer schema."""
+
+
+class MemoryFileWarning(UserWarning):
+    """Something beside a memory file that is not its own; the command line prints it as a note."""
 
 
 class UnknownIdError(List3rError):
@@ -73,6 +79,8 @@ def check_share(name: str, value: float) -> None:
         raise OptionError(f"{name} {value:g} must lie between 0 and 1")
 
 
+DISTRIBUTION = "list3r-memory"
+"""This program's name in package indexes, where `list3r` is somebody else's."""
 EXTRA_OF_PACKAGE = {
     "cv2": "build",
     "numba": "build",
@@ -104,6 +112,34 @@ EXTRA_OF_PACKAGE = {
 """Modules that a smaller install lacks, and the extra of this package that brings each."""
 
 
+def install_hint(extra: str, *also: str) -> str:
+    """Return the command that adds an extra, and further packages, to the installation that runs.
+
+    From a checkout it installs the checkout, elsewhere the distribution to which the running files belong.
+    """
+    root = Path(__file__).resolve().parents[2]
+    checkout = _is_checkout(root)
+    what = f"'.[{extra}]'" if checkout else f"'{_distribution()}[{extra}]'"
+    command = " ".join(("pip install", what, *also))
+    return f"{command} in the folder {shlex.quote(str(root))}" if checkout and not root.samefile(".") else command
+
+
+def _is_checkout(root: Path) -> bool:
+    """Whether a folder is one of ours to install from; other packages leave a `pyproject.toml` among installed ones."""
+    try:
+        return f'name = "{DISTRIBUTION}"' in (root / "pyproject.toml").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _distribution() -> str:
+    """Return the name under which what runs was installed; the usual one where several or none claim the module."""
+    from importlib import metadata  # takes longer than many a question
+
+    owners = metadata.packages_distributions().get("list3r", [])
+    return owners[0] if len(owners) == 1 else DISTRIBUTION
+
+
 @contextmanager
 def naming_extras() -> Iterator[None]:
     """Turn a missing package of an extra into `MissingPackageError`, which names what to install."""
@@ -113,5 +149,5 @@ def naming_extras() -> Iterator[None]:
         module = (error.name or "").partition(".")[0]
         if module not in EXTRA_OF_PACKAGE:
             raise
-        install = f"pip install 'list3r[{EXTRA_OF_PACKAGE[module]}]'"
+        install = install_hint(EXTRA_OF_PACKAGE[module])
         raise MissingPackageError(f"this needs {module}, which is not installed: {install}") from None

@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlparse
 from urllib.request import getproxies
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, install_hint
 from list3r.models.cards import UNPINNED, Weights
 
 CONFIG = "config.json"
@@ -118,7 +118,7 @@ def fetch(weights: Weights, revision: str | None = None) -> Cached:
         from huggingface_hub import constants, snapshot_download
         from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
     except ImportError:
-        raise OptionError("downloading weights needs a package: pip install 'list3r[models]'") from None
+        raise OptionError(f"downloading weights needs a package: {install_hint('models')}") from None
     name, wanted = weights.repository, revision or weights.revision
     if not _is_known(constants.ENDPOINT):  # refused at once; the package would try for half a minute
         raise OptionError(f"{name}@{wanted} cannot be fetched: {NO_NETWORK.format(name=name)}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, install_hint
 
 PARTS = ("geometry", "discovery", "tracking", "features", "text", "detector", "local features", "descriptor")
 """What a model can be in a pipeline."""
@@ -92,12 +92,14 @@ class ModelCard:
     packages: tuple[str, ...]
     """Modules that must be importable."""
     install: str
-    """What installs them."""
+    """The command that installs them; further packages beside those of `extra`, where that is given."""
     memory: MemoryFigures | None = None
     pixels: int = 0
     """Pixels of its pictures, at most, where `memory` is known."""
     about: str = ""
     """One line on what it is good for."""
+    extra: str | None = None
+    """Extra of this program that brings them."""
 
     def __post_init__(self) -> None:
         assert self.part in PARTS
@@ -111,6 +113,11 @@ class ModelCard:
         return self.memory if known is None or known.memory is None else known.memory
 
     @property
+    def installed_by(self) -> str:
+        """The command that installs its packages."""
+        return self.install if self.extra is None else install_hint(self.extra, *self.install.split())
+
+    @property
     def commercial(self) -> bool:
         """Whether code and default weights allow commercial use without asking anyone."""
         terms = (self.code, *(w.licence for w in self.weights[:1]))
@@ -120,14 +127,13 @@ class ModelCard:
 SAM2_COMMIT = "de431c4043854a71d8101e17995dfe596bf101a5"
 SAM3_COMMIT = "3c879f39826c281e95690f02c7821c4de09afae7"
 _TRANSFORMERS = ("transformers",)
-_MODELS_EXTRA = "pip install 'list3r[models]'"
 _GIT = "pip install git+https://github.com"
 
 
 def _hub(name: str, part: str, weights: Weights, about: str, also: tuple[str, ...] = ()) -> ModelCard:
     """Return the card of a model that the package transformers runs, with the help of other packages."""
-    install = " ".join((_MODELS_EXTRA, *also))
-    return ModelCard(name, part, APACHE, (weights,), (*_TRANSFORMERS, *also), install, about=about)
+    packages = (*_TRANSFORMERS, *also)
+    return ModelCard(name, part, APACHE, (weights,), packages, " ".join(also), about=about, extra="models")
 
 
 DA3_SMALLER = MemoryFigures(2500, 600, "weights counted (0.14 G parameters); the rest as the giant's")

@@ -56,7 +56,7 @@ def check_package(card: ModelCard) -> None:
     """Raise `OptionError`, with what installs it, when a package of the card is missing."""
     missing = missing_package(card)
     if missing is not None:
-        raise OptionError(f"{card.name} needs the package {missing}: {card.install}")
+        raise OptionError(f"{card.name} needs the package {missing}: {card.installed_by}")
 
 
 def pinned_weights(selection: ModelSelection, asked: Mapping[str, str], profile: str) -> dict[str, str]:

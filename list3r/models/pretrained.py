@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError, check_choice, first_line
+from list3r.memory.errors import OptionError, check_choice, first_line, install_hint
 from list3r.models.cache import CONFIG, check_weights
 from list3r.models.device import out_of_memory_reported
 
@@ -117,7 +117,7 @@ def _transformers_class(name: str) -> Any:
     try:
         import transformers
     except ImportError:
-        raise OptionError(f"{name} needs the package transformers; pip install 'list3r[models]'") from None
+        raise OptionError(f"{name} needs the package transformers; {install_hint('models')}") from None
     found = getattr(transformers, name, None)
     if found is None:
         raise OptionError(f"this version of transformers ({transformers.__version__}) has no {name}; upgrade it")

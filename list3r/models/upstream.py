@@ -38,12 +38,12 @@ def upstream_class(card: ModelCard, module: str, name: str) -> Any:
             found = import_module(module)
     except ImportError as error:
         missing = error.name or module
-        hint = card.install if missing.split(".")[0] in card.packages else f"pip install {missing.split('.')[0]}"
+        hint = card.installed_by if missing.split(".")[0] in card.packages else f"pip install {missing.split('.')[0]}"
         raise OptionError(f"{card.name} needs the package {missing.split('.')[0]}: {hint}") from None
     except Exception as error:  # binary packages that do not fit each other raise anything
         raise OptionError(f"{card.name} needs {module}, which cannot be imported here: {first_line(error)}") from None
     if not hasattr(found, name):
-        raise OptionError(f"this version of {module} has no {name}: {card.install}")
+        raise OptionError(f"this version of {module} has no {name}: {card.installed_by}")
     return getattr(found, name)
 
 

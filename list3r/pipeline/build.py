@@ -16,14 +16,13 @@ from list3r import __version__
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.errors import TrackingError
 from list3r.memory.records import ChunkResult
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import finish_session
 from list3r.pipeline.reports import BuildReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Before, Job, Plan, add_chunks, chunk_pool, lost_reasons, plan_session, prepare
+from list3r.pipeline.session import Before, Job, add_chunks, check_posed, chunk_pool, plan_session, prepare
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import Target, make_folder, open_target
 from list3r.reconstruction.registry import entry
@@ -56,7 +55,7 @@ def build(
         with chunk_pool(job) as pool:
             plan = plan_session(target.store, session, job, watch, pool)
             add_chunks(target.store, job, plan, pool, watch, partial(_keep, target))
-        _check_posed(target.store, job.info, plan)
+        check_posed(target.store, plan.session, job.info)
         with threadpool_limits(1):
             finish_session(target.store, session, job.settings.association, job.settings.carving)
         report = build_report(target.store, plan, started)
@@ -103,14 +102,3 @@ def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:
     if info.has_depth and entry(settings.reconstruction).needs_depth:
         return "sensor depth"
     return "given poses" if settings.poses == "given" else "none"
-
-
-def _check_posed(store: Store, info: SourceInfo, plan: Plan) -> None:
-    """Raise `TrackingError` where the camera is placed in no frame."""
-    frames = store.frames.all(plan.session)
-    if any(f.state == "posed" for f in frames):
-        return
-    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
-    hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
-    reasons = "; ".join(filter(None, (*lost_reasons(store, plan.session)[:1], hint)))
-    raise TrackingError(f"the camera could not be tracked in any frame of {info.path} ({count}); {reasons}")

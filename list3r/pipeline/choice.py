@@ -164,7 +164,7 @@ def _check_used(asked: Mapping[str, str], selection: ModelSelection) -> None:
 
 def _local_features(words: str) -> tuple[str, str | None]:
     """Return kind and file of `--local-features`. Raises `OptionError` for what is not known or cannot be loaded."""
-    from list3r.reconstruction.features.learned import KINDS, make_detector
+    from list3r.reconstruction.features.detectors import KINDS, make_detector
 
     kind, _, file = words.partition("=")
     if kind == "sift" and not file:

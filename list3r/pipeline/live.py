@@ -27,7 +27,7 @@ from list3r.frames.live.spooled import StreamFeed
 from list3r.frames.live.stream import open_camera
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.rosbag import is_recording
-from list3r.memory.errors import MemoryFileError, OptionError, SourceError, TrackingError
+from list3r.memory.errors import MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
 from list3r.pipeline.chunks.calibration import estimated_camera, with_camera
@@ -36,7 +36,7 @@ from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import add_chunk, finish_session
 from list3r.pipeline.reports import BuildReport, LiveReport, build_report
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
-from list3r.pipeline.session import Before, Job, Plan, note_lost, prepare, settled_step
+from list3r.pipeline.session import Before, Job, Plan, check_posed, note_lost, prepare, settled_step
 from list3r.pipeline.settings import BuildSettings
 from list3r.pipeline.target import Target, open_target
 from list3r.pipeline.workers import OrderedPool
@@ -145,8 +145,7 @@ def build_live(
             ours = _begun(target.store, feed, job, first, watch)
             _follow(ours, target, how, interrupted, watch)
             store, state = target.store, feed.state()
-            if not any(f.state == "posed" for f in store.frames.all()):
-                raise TrackingError(f"the camera could not be tracked in any frame of {job.info.path}")
+            check_posed(store, ours.session, job.info)
             with threadpool_limits(1):
                 finish_session(store, ours.session, job.settings.association, job.settings.carving)
             with store.transaction():

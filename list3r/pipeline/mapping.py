@@ -55,21 +55,12 @@ def add_chunk(
         chunk_id = store.chunks.add(session_id, result)
         named = {i.local_id: votes_of_names(i.names) for i in result.library.instances if i.names}
         if named:
-            put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named, fresh=True)
+            put_votes(store, chunk_id, result.library.feature_space.partition("/")[0], named)
         probable = {i.local_id: votes_of_probabilities(i.named) for i in result.library.instances if i.named}
         if probable:
-            put_votes(store, chunk_id, OWN_NAMES, probable, fresh=True)
-        given = poses_given(store, session_id)
-        if given:
-            store.edges.add(_edge_of_given_poses(store, session_id))
-        else:
-            adjacent = _adjacent_edge(store, session_id, chosen, debug_dir)
-            store.edges.add(adjacent)
-            given = any(in_one_frame(e) for e in adjacent)
-            store.edges.add([] if given else _prior_edge(store, session_id, result, chosen))
-        if not given or len(store.sessions.all()) > 1:
-            loops = find_loops(store, chunk_id, joint, chosen.revisits)
-            store.edges.add(_refined(store, e, chosen.reprojection) if e.accepted else e for e in loops)
+            put_votes(store, chunk_id, OWN_NAMES, probable)
+        if result.posed.any():
+            _relate(store, session_id, chunk_id, result, joint, chosen, debug_dir)
         place_chunks(store, chosen, chunk_id)
         if debug_dir is not None:
             _draw_loops(store, chunk_id, debug_dir)
@@ -78,15 +69,44 @@ def add_chunk(
     return chunk_id
 
 
+def _relate(
+    store: Store,
+    session_id: int,
+    chunk_id: int,
+    result: ChunkResult,
+    joint: JointReconstructor | None,
+    how: AssociationSettings,
+    debug_dir: Path | None,
+) -> None:
+    """Add the edges of a new chunk that holds something: to the one before of these, and to places seen before."""
+    given = poses_given(store, session_id)
+    if given:
+        store.edges.add(_edge_of_given_poses(store, session_id))
+    else:
+        adjacent = _adjacent_edge(store, session_id, how, debug_dir)
+        store.edges.add(adjacent)
+        given = any(in_one_frame(e) for e in adjacent)
+        store.edges.add([] if given else _prior_edge(store, session_id, result, how))
+    if not given or len(store.sessions.all()) > 1:
+        loops = find_loops(store, chunk_id, joint, how.revisits)
+        store.edges.add(_refined(store, e, how.reprojection) if e.accepted else e for e in loops)
+
+
+def _last_two(store: Store, session_id: int) -> list[ChunkRow]:
+    """The new chunk of a session and the one before it, of those that hold something."""
+    blank = store.chunks.blank()
+    return [c for c in store.chunks.all(session_id) if c.chunk_id not in blank][-2:]
+
+
 def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debug_dir: Path | None) -> list[Edge]:
     """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it.
 
     What moved between the two is flagged on the way.
     """
-    chunks = store.chunks.all(session_id)
+    chunks = _last_two(store, session_id)
     if len(chunks) < 2:
         return []
-    u, v = chunks[-2], chunks[-1]
+    u, v = chunks
     metric = u.scale_kind == v.scale_kind == "metric"
     samples_u, samples_v = store.chunks.samples(u.chunk_id), store.chunks.samples(v.chunk_id)
     by_cameras = None
@@ -114,10 +134,11 @@ def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debu
 
 def _prior_edge(store: Store, session_id: int, result: ChunkResult, how: AssociationSettings) -> list[Edge]:
     """The edge to the chunk before by poses that the source gives as a prior; none where it gives none."""
-    chunks = store.chunks.all(session_id)
+    chunks = _last_two(store, session_id)
     if len(chunks) < 2 or session_settings(store.sessions.get(session_id)).poses != "prior":
         return []
-    edge = prior_edge(chunks[-2], store.frames.of(chunks[-2]), result, chunks[-1].chunk_id, how.prior)
+    u, v = chunks
+    edge = prior_edge(u, store.frames.of(u), result, v.chunk_id, how.prior)
     return [] if edge is None else [edge]
 
 
@@ -153,10 +174,10 @@ def _camera(chunk: ChunkRow) -> Camera:
 
 def _edge_of_given_poses(store: Store, session_id: int) -> list[Edge]:
     """With given poses all chunks have the source's own world as their frame."""
-    chunks = store.chunks.all(session_id)
+    chunks = _last_two(store, session_id)
     if len(chunks) < 2:
         return []
-    u, v = chunks[-2].chunk_id, chunks[-1].chunk_id
+    u, v = (c.chunk_id for c in chunks)
     return [Edge(u, v, "adjacent", Sim3.identity(), 1.0, 1.0, 0, 0.0, True, "both lie in the source's own world")]
 
 

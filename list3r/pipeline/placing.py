@@ -40,12 +40,17 @@ def place_chunks(
     """Optimise the graph, find which way is up, and write where every chunk lies.
 
     With the id of a `new` chunk in a long video only what that chunk touches is solved; `finish_session` solves all.
-    With `bend` it is also found how each chunk bends.
+    With `bend` it is also found how each chunk bends. Chunks that hold nothing take no part: they come to lie
+    where their neighbour does.
     """
     how = settings or AssociationSettings()
-    chunks = store.chunks.all()
+    blank = store.chunks.blank()
+    chunks = [c for c in store.chunks.all() if c.chunk_id not in blank]
+    if new in blank or not chunks:
+        _place_blank(store, blank)
+        return
     measured = store.edges.all()
-    session_of = {c.chunk_id: c.session_id for c in chunks}
+    session_of = {c.chunk_id: c.session_id for c in store.chunks.all()}
     edges = hold_back(measured, session_of, _metre(chunks), how.ties)
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
@@ -71,14 +76,35 @@ def place_chunks(
     if fitted and len(chunks) > how.up_always and settled:
         _place_fitted(store, graph, known)
         return
-    stated_up = _stated_up(store, graph)
-    gravity = estimate_gravity(store, graph.S_graph_chunk, graph.components, stated_up=stated_up)
+    stated_up = _stated_up(store, graph, chunks)
+    apart = {**graph.components, **{k: k for k in blank}}
+    gravity = estimate_gravity(store, graph.S_graph_chunk, apart, stated_up=stated_up)
     upright = world_from_graph(gravity)
-    rows = [replace(c, component=graph.components[c.chunk_id]) for c in store.chunks.all()]
+    rows = [replace(c, component=graph.components[c.chunk_id]) for c in chunks]
     S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
     store.facts.S_world_graph = S_world_graph
     store.facts.gravity = gravity.status
-    store.chunks.place({k: S_world_graph @ S for k, S in graph.S_graph_chunk.items()}, graph.components, known)
+    placed = {c.chunk_id: S_world_graph @ graph.S_graph_chunk[c.chunk_id] for c in chunks}
+    store.chunks.place(placed, graph.components, known)
+    _place_blank(store, blank)
+
+
+def _place_blank(store: Store, blank: Collection[int]) -> None:
+    """Let chunks that hold nothing lie with the one before in their session, or else the one behind.
+
+    So they are no part of the world that could not be joined to the others.
+    """
+    beside: dict[int, ChunkRow] = {}
+    for session in store.sessions.all() if blank else ():
+        rows = store.chunks.all(session.session_id)
+        near = next((c for c in rows if c.chunk_id not in blank), None)
+        for row in rows:
+            if row.chunk_id not in blank:
+                near = row
+            elif near is not None:
+                beside[row.chunk_id] = near
+    poses = {k: c.S_world_chunk for k, c in beside.items()}
+    store.chunks.place(poses, {k: c.component for k, c in beside.items()})
 
 
 def _turning(store: Store, chunks: Sequence[ChunkRow], edges: Sequence[Edge]) -> set[int]:
@@ -181,11 +207,11 @@ def _as_bent(store: Store, graph: GraphResult, new: int, how: AssociationSetting
     return replace(graph, S_graph_chunk=ChainMap({new: placed}, *layers))
 
 
-def _stated_up(store: Store, graph: GraphResult) -> NDArray[np.float64] | None:
+def _stated_up(store: Store, graph: GraphResult, chunks: Sequence[ChunkRow]) -> NDArray[np.float64] | None:
     """Up in the graph's frame (3,), as chunks say whose frame has z up by their source; None where no source knows."""
     stating = {s.session_id for s in store.sessions.all() if session_settings(s).up == "source"}
     main = min(graph.components.values(), default=0)
-    rows = [c.chunk_id for c in store.chunks.all() if c.session_id in stating]
+    rows = [c.chunk_id for c in chunks if c.session_id in stating]
     ups = [graph.S_graph_chunk[k].rotation[:, 2] for k in rows if graph.components[k] == main]
     total = np.sum(ups, axis=0) if ups else np.zeros(3)
     length = float(np.linalg.norm(total))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from list3r.association.revisits.session_ties import HELD
-from list3r.memory.records import Edge, JsonFields
+from list3r.memory.records import Edge, FrameRow, JsonFields
 from list3r.memory.store.store import Store
 from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
 
@@ -107,7 +107,7 @@ def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
         frames_per_second=round(plan.fresh_frames() / seconds, 2),
         resumed_chunks=len(plan.done),
         stage_seconds={k: round(v, 2) for k, v in store.chunks.stage_seconds().items()},
-        notes=_build_notes(store, plan.session, lost, bad, components),
+        notes=_build_notes(store, plan.session, lost, components),
     )
 
 
@@ -140,6 +140,7 @@ def update_report(store: Store, plan: Plan, started: float) -> UpdateReport:
         resumed_chunks=len(plan.done),
         notes=(
             *settled_notes(store, session),
+            *_bad_notes(frames),
             *_update_notes(len(own), placed, held(store, session), lost, len(frames)),
             *lost_reasons(store, session),
         ),
@@ -175,13 +176,12 @@ def held(store: Store, session: int) -> int:
     return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges.all())
 
 
-def _build_notes(store: Store, session: int, lost: int, bad: int, components: int) -> tuple[str, ...]:
+def _build_notes(store: Store, session: int, lost: int, components: int) -> tuple[str, ...]:
     notes = list(settled_notes(store, session))
     cuts = shot_cuts(store, session)
     if cuts:
         notes.append(f"the video jumps at frame {', '.join(str(c) for c in cuts)}; chunks end there")
-    if bad:
-        notes.append(f"{_count(bad, 'frame')} could not be used, skipped: {_listed(store)}")
+    notes += _bad_notes(store.frames.all(session))
     if lost and store.facts.poses == "given":
         notes.append(
             f"{_count(lost, 'frame')} came without a valid pose and are left out; --poses estimate needs no poses"
@@ -197,19 +197,22 @@ def _build_notes(store: Store, session: int, lost: int, bad: int, components: in
     return tuple(notes)
 
 
-def _runs(numbers: Sequence[int], most: int = 5) -> str:
-    """Ascending numbers in words: those that follow each other by their first and last."""
+def _bad_notes(frames: Sequence[FrameRow]) -> tuple[str, ...]:
+    """What is said of the frames of a session that could not be used, with why of the first of each stretch."""
+    bad = {f.frame_index: f.note for f in frames if f.state == "bad"}
+    if not bad:
+        return ()
+    doubt = "; is the copy of the source complete?" if 2 * len(bad) > len(frames) else ""
+    return (f"{len(bad)} of {_count(len(frames), 'frame')} could not be used: {_runs(sorted(bad), bad)}{doubt}",)
+
+
+def _runs(numbers: Sequence[int], why: Mapping[int, str] | None = None, most: int = 5) -> str:
+    """Ascending numbers in words: those that follow each other by their first and last, `why` of the first behind."""
     breaks = [k for k in range(1, len(numbers)) if numbers[k] != numbers[k - 1] + 1]
     runs = [(numbers[a], numbers[b - 1]) for a, b in pairwise([0, *breaks, len(numbers)])]
-    shown = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in runs[:most])
-    return shown + (f" and {len(runs) - most} more stretches" if len(runs) > most else "")
+    named = [(f"{a}" if a == b else f"{a} to {b}") + (f" ({why[a]})" if why else "") for a, b in runs[:most]]
+    return ", ".join(named) + (f" and {len(runs) - most} more stretches" if len(runs) > most else "")
 
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def _listed(store: Store, most: int = 5) -> str:
-    rows = store.frames.bad()
-    shown = ", ".join(f"{f.frame_index} ({f.note})" for f in rows[:most])
-    return shown + (f" and {len(rows) - most} more" if len(rows) > most else "")

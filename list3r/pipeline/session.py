@@ -16,9 +16,9 @@ from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.chunking.pace import PaceSettings, depth_step
 from list3r.frames.pose_agreement import disagreements
-from list3r.frames.source import SourceOptions, check_bad_share, open_source
+from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.registry import check_choice
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, TrackingError
 from list3r.memory.records import ChunkResult
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.store import Store
@@ -213,13 +213,11 @@ def add_chunks(
     """Work on the chunks side by side and add them in order, with one thread, so that sums are those of any machine.
 
     Those of a later session are only placed. `added` hears of every part that came into the memory.
-    Raises `SourceError` when more than half of the frames cannot be decoded.
     """
     if plan.first is None:
         return
     first, session, count = plan.first, plan.session, job.info.frame_count
     later = session != store.sessions.all()[0].session_id
-    bad = {f.frame_index for f in store.frames.bad() if f.session_id == session}
     watch.show(store.frames.count(session), count)
     known = {c.index for c in store.chunks.all(session)}
     how = _asking_networks(job.settings)
@@ -228,12 +226,8 @@ def add_chunks(
     with threadpool_limits(1):
         joint = joint_windows(store, session, first, pool)
         for task, results in zip(plan.tasks(), pool.map(plan.tasks()), strict=True):
-            found = [row for part in results for row in part.bad_frames]
-            bad.update(index for index, _ in found)
-            check_bad_share(len(bad), count, found[0][1] if found else "")
             for part in (p for p in results if p.index not in known):
-                due = not later and _library_due(len(store.chunks.all()) + 1, how)
-                add_chunk(store, session, part, joint, how, library=due, debug_dir=watch.debug_dir)
+                add_chunk(store, session, part, joint, how, library=not later, debug_dir=watch.debug_dir)
                 note_lost(store, session, part)
                 added(part)
             watch.show(task.span.stop, count)
@@ -262,11 +256,6 @@ def chunk_pool(job: Job) -> ChunkPool:
     return pool
 
 
-def _library_due(chunks: int, how: AssociationSettings) -> bool:
-    """Return whether the library is derived with the last of so many chunks: the same after a kill as without."""
-    return chunks <= how.library_always or chunks % how.library_every == 0
-
-
 MOST_DEPTH_EVERY = 8
 """Chunks are so many times as long, and their pictures are held in memory."""
 _MOST_REASONS = 5
@@ -280,6 +269,25 @@ def take_back(store: Store, session: int) -> None:
         store.sessions.drop(session)
         if placed:
             place_chunks(store, stored_settings(store, AssociationSettings, "association"), bend=True)
+
+
+def check_posed(store: Store, session: int, info: SourceInfo, after: str = "") -> None:
+    """Raise `SourceError` where no frame of a session can be used, `TrackingError` where the camera is placed in none.
+
+    `after` says what is left then.
+    """
+    frames = store.frames.all(session)
+    if any(f.state == "posed" for f in frames):
+        return
+    bad = [f for f in frames if f.state == "bad"]
+    end = f"; {after}" if after else ""
+    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    if bad and len(bad) == len(frames):
+        raise SourceError(f"none of {count} of {info.path} can be used ({bad[0].note}); is the copy complete?{end}")
+    of_these = f", {len(bad)} of which cannot be used: {bad[0].note}" if bad else ""
+    hint = "check the depth scale and intrinsics with `list3r inspect`" if info.has_depth else ""
+    reasons = "; ".join(filter(None, (*lost_reasons(store, session)[:1], hint, after)))
+    raise TrackingError(f"the camera could not be tracked in any frame of {info.path} ({count}{of_these}); {reasons}")
 
 
 def lost_reasons(store: Store, session: int) -> list[str]:

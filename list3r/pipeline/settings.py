@@ -52,11 +52,6 @@ class AssociationSettings:
     stands until the session is finished: to turn the world is to touch all of it."""
     up_again: int = 32
     """Where up is not known yet it is asked again after so many chunks."""
-    library_always: int = 4
-    """Chunks up to which every new one has the library derived."""
-    library_every: int = 4
-    """Beyond, every so many chunks do, and the end of the session: all that a place was seen by is looked at once for
-    them. Of a stream every chunk does, however many."""
 
 
 @dataclass(frozen=True)

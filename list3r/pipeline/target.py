@@ -13,6 +13,7 @@ from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.file import rename_exclusively, taken
 from list3r.memory.store.store import Store
+from list3r.pipeline.interrupts import uninterrupted
 from list3r.pipeline.settings import BuildSettings, session_settings
 
 
@@ -39,11 +40,12 @@ class Target:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.store.close()
-        if kind is not None and self._fresh:
-            remove_memory(self.store.path)
-            if self._replaced is not None:
-                rename_exclusively(self._replaced, self.store.path)
+        with uninterrupted():
+            self.store.close()
+            if kind is not None and self._fresh:
+                remove_memory(self.store.path)
+                if self._replaced is not None:
+                    rename_exclusively(self._replaced, self.store.path)
 
 
 def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume: bool, force: bool) -> Target:
@@ -58,7 +60,7 @@ def open_target(path: Path, info: SourceInfo, settings: BuildSettings, *, resume
     aside = path.with_name(f"{path.name}.replaced")  # the old memory until a camera is placed in the new one
     if not path.exists():
         if not _is_memory(aside):
-            return Target(Store.create(path), fresh=True)
+            return _created(path)
         rename_exclusively(aside, path)  # a replacement was killed before the new memory was there
     if resume and not force:
         with Store.open(path) as store:
@@ -84,18 +86,36 @@ def _replacing(path: Path, aside: Path) -> Target:
     if os.path.lexists(aside) and not ours:
         raise MemoryFileError(f"{aside} is in the way: --force keeps {path.name} there while it builds; move it away")
     Store.open(path, writable=True).close()
-    if ours and not begun:
-        remove_memory(path)
-    else:
-        aside.unlink(missing_ok=True)
-        rename_exclusively(path, aside)
+    target = None
     try:
-        target = Target(Store.create(path), fresh=True, replaced=aside)
-    except BaseException:
-        rename_exclusively(aside, path)
+        with uninterrupted():
+            if ours and not begun:
+                remove_memory(path)
+            else:
+                aside.unlink(missing_ok=True)
+                rename_exclusively(path, aside)
+            target = Target(Store.create(path), fresh=True, replaced=aside)
+            with target.store.transaction():
+                target.store.facts.replaces = _identity(aside)
+    except BaseException as error:
+        if target is not None:
+            target.__exit__(type(error), error, error.__traceback__)
+        elif not os.path.lexists(path):
+            rename_exclusively(aside, path)
         raise
-    with target.store.transaction():
-        target.store.facts.replaces = _identity(aside)
+    return target
+
+
+def _created(path: Path) -> Target:
+    """A new memory where none was; an interruption leaves none."""
+    target = None
+    try:
+        with uninterrupted():
+            target = Target(Store.create(path), fresh=True)
+    except BaseException as error:
+        if target is not None:
+            target.__exit__(type(error), error, error.__traceback__)
+        raise
     return target
 
 

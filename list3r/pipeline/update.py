@@ -12,10 +12,9 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
 from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.errors import MemoryFileError, OptionError, TrackingError
+from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import finish_session
@@ -26,8 +25,8 @@ from list3r.pipeline.session import (
     Job,
     Plan,
     add_chunks,
+    check_posed,
     chunk_pool,
-    lost_reasons,
     plan_session,
     prepare,
     take_back,
@@ -71,7 +70,7 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
         with chunk_pool(job) as pool:
             plan = plan_session(store, session, job, watch, pool)
             add_chunks(store, job, plan, pool, watch)
-        _check_posed(store, session, job.info)
+        check_posed(store, session, job.info, "the memory is as it was")
     except BaseException:
         with suppress(MemoryFileError):  # the first error is reported; the next update takes it back
             if not _begun(store, session):
@@ -85,13 +84,6 @@ def _added(store: Store, session: int, job: Job, watch: Watch) -> Plan:
 def _begun(store: Store, session: int) -> bool:
     """Whether the camera of any frame of a session is placed."""
     return any(f.state == "posed" for f in store.frames.all(session))
-
-
-def _check_posed(store: Store, session: int, info: SourceInfo) -> None:
-    if not _begun(store, session):
-        why = lost_reasons(store, session)
-        reasons = "; ".join(("the memory is as it was", *why[:1]))
-        raise TrackingError(f"the camera could not be tracked in any frame of {info.path}; {reasons}")
 
 
 def _session(store: Store, job: Job) -> int:

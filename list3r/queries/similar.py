@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from list3r.memory.errors import OptionError, SpaceMismatchError
 from list3r.memory.records import Instance
-from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.search.vectors import VectorIndex, unit, unit_query
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_count, checked_instance, of_one_state
 
@@ -65,17 +65,13 @@ def similar(
 
 def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: int, filters: Filters) -> list[Match]:
     """Compare by the first `part` numbers of all vectors, of which there is no index."""
-    query = np.asarray(vector, np.float64)
-    length = float(np.linalg.norm(query))
-    if not np.isfinite(length) or length == 0.0:
-        raise OptionError("the vector to compare with must be finite and not zero")
+    query = unit_query(vector)
     ids, cosines = [], []
     for some, vectors in store.embeddings.batches(space):
         if vectors.shape[1] < part:
             raise SpaceMismatchError(f"part {part}: the space {space} has fewer numbers")
-        head = vectors[:, :part].astype(np.float64)
         ids.append(some)
-        cosines.append(head @ query / np.maximum(np.linalg.norm(head, axis=1) * length, 1e-12))
+        cosines.append(unit(vectors[:, :part]) @ query)
     order = np.lexsort((np.concatenate(ids), -np.concatenate(cosines))) if ids else np.zeros(0, np.int64)
     out: list[Match] = []
     for start in range(0, len(order), _BATCH):

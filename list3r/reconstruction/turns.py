@@ -2,7 +2,7 @@
 
 A new frame takes its scale from points that frames before it placed, and those are placed by parallax. A camera that
 turns where it stands shows next to no parallax while they leave the picture, so errors of a fraction of a pixel make
-what comes after the turn larger or smaller than what comes before, by a tenth or more (decision 0208).
+what comes after the turn larger or smaller than what comes before, by a tenth or more (research/colour-video 0208).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.description.coco import COCO_80
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, install_hint
 from list3r.semantics.detector import Detections
 
 _MEAN_BGR = (103.53, 116.28, 123.675)
@@ -181,7 +181,7 @@ def _load(param: Path) -> Any:
     try:
         import ncnn
     except ImportError:
-        raise OptionError('--detector needs ncnn, which is not installed: pip install "list3r[detector]"') from None
+        raise OptionError(f"--detector needs ncnn, which is not installed: {install_hint('detector')}") from None
     weights = param.with_suffix(".bin")
     if not weights.is_file():
         raise OptionError(f"--detector {param}: its weights {weights.name} are not beside it")

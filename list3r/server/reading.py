@@ -12,6 +12,7 @@ from mcp.server.mcpserver.utilities.types import Image
 from pydantic import Field
 
 from list3r.api import SceneMemory
+from list3r.memory.description.printable import shown
 from list3r.memory.errors import OptionError
 from list3r.queries.match import Match
 from list3r.queries.relations import Relations
@@ -53,7 +54,7 @@ class ReadingTools:
         names = Counter(name_of(i) for i in things).most_common(30)
         corners = np.array([i.aabb for i in everything if np.isfinite(i.aabb).all()]).reshape(-1, 3)
         return {
-            "memory": m.path.name,
+            "memory": shown(m.path.name),
             "units": m.units,
             "gravity": m.gravity,
             "up": None if m.gravity == "unknown" else "z",
@@ -154,8 +155,8 @@ class ReadingTools:
         found = m.relations_of(i.id)
         return {
             **instance_record(i),
-            "label": i.label,
-            "description": i.description,
+            "label": None if i.label is None else shown(i.label),
+            "description": shown(i.description),
             "structure": i.structure,
             "color": i.color_name,
             "axes": [numbers(axis) for axis in i.box.rotation.T],

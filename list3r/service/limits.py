@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import json
 import os
 import time
 from collections import Counter, defaultdict
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -23,7 +24,7 @@ Send = Callable[[Message], Awaitable[None]]
 Application = Callable[[Message, Receive, Send], Awaitable[None]]
 
 OPEN_PATHS = frozenset(("/health",))
-"""Answered without a token; they say nothing of what is catalogued."""
+"""Answered without a token, and once a connection; they say nothing of what is catalogued."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +33,21 @@ class ServiceLimits:
 
     request_bytes: int = 256 * 1024
     request_s: float = 10.0
-    """For the whole of a request, from its headers to the last byte of the answer."""
+    """For the headers of a request, from the connection or the last answer on; again as much for body and answer."""
     at_once: int = 64
-    """Requests of one process."""
+    """Requests that one process answers; one that is still arriving does not count."""
+    open_at_once: int = 512
+    """Connections of one process; beyond that those which have waited longest make room."""
+    of_one_address: int = 256
+    """Connections of one address to one process."""
     answers: int = 200
     """Of one page."""
     connections: int = 8
     """To the database, of one process."""
 
     def __post_init__(self) -> None:
-        if min(self.request_bytes, self.at_once, self.answers, self.connections) < 1 or not self.request_s > 0:
+        counts = (self.request_bytes, self.at_once, self.open_at_once, self.of_one_address, self.answers)
+        if min(*counts, self.connections) < 1 or not self.request_s > 0:
             raise OptionError("the limits of a service must be above 0")
 
 
@@ -71,13 +77,14 @@ class Guard:
 
     def __init__(self, inner: Application, secret: str, limits: ServiceLimits, metrics: Metrics) -> None:
         self._inner, self._secret, self._limits, self._metrics = inner, secret, limits, metrics
+        self._answering = 0
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """Answer one request."""
         if scope["type"] != "http":
             await self._inner(scope, receive, send)
             return
-        answer, began = _Answer(send), time.monotonic()
+        answer, began = _Answer(send, closes=scope["path"] in OPEN_PATHS), time.monotonic()
         self._metrics.under_way += 1
         try:
             async with asyncio.timeout(self._limits.request_s):
@@ -114,8 +121,15 @@ class Guard:
                 return
             if not message.get("more_body", False):
                 break
+        if self._answering >= self._limits.at_once:
+            await answer.refuse(503, "BusyError", f"{self._answering} requests are being answered; ask again later")
+            return
         whole: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
-        await self._inner(scope, lambda: _next(whole, receive), answer)
+        self._answering += 1
+        try:
+            await self._inner(scope, lambda: _next(whole, receive), answer)
+        finally:
+            self._answering -= 1
 
 
 async def _next(whole: list[Message], receive: Receive) -> Message:
@@ -125,20 +139,23 @@ async def _next(whole: list[Message], receive: Receive) -> Message:
 class _Answer:
     """Sends an answer, and knows its status."""
 
-    def __init__(self, send: Send) -> None:
-        self._send = send
+    def __init__(self, send: Send, *, closes: bool) -> None:
+        """`closes`: the answer ends the connection."""
+        self._send, self._closes = send, closes
         self.status = 0
 
     async def __call__(self, message: Message) -> None:
         if message["type"] == "http.response.start":
             self.status = int(message["status"])
+            if self._closes:
+                message["headers"] = [*message["headers"], (b"connection", b"close")]
         await self._send(message)
 
     async def refuse(self, status: int, kind: str, text: str) -> None:
         """Answer with an error, unless another answer has begun."""
         if self.status:
             return
-        headers = [(b"content-type", b"application/json"), (b"connection", b"close")]
+        headers, self._closes = [(b"content-type", b"application/json")], True
         if status == 401:
             headers.append((b"www-authenticate", b"Bearer"))
         await self({"type": "http.response.start", "status": status, "headers": headers})
@@ -152,18 +169,72 @@ def error_answer(status: int, kind: str, message: str) -> dict[str, Any]:
 
 
 class BoundedProtocol(H11Protocol):
-    """A connection that is closed where the headers of its request do not come in time."""
+    """A connection that ends when a request does not arrive, or its answer is not taken, in time, and sooner when
+    others need its place while it waits.
+    """
+
+    def __init__(self, *args: Any, limits: ServiceLimits, **words: Any) -> None:
+        super().__init__(*args, **words)
+        self._limits = limits
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait."""
+        """Begin to wait for a request."""
         super().connection_made(transport)
-        self._deadline = self.loop.call_later(self.timeout_keep_alive, self._close_if_idle)
+        self.address = _network(self.client[0]) if self.client else ""
+        self.waits_since = self.loop.time()
+        self._deadline = self.loop.call_later(self._limits.request_s, self.cut)
+        self.loop.call_later(0.0, self._make_room)  # once what has arrived on other connections is read
 
-    def _close_if_idle(self) -> None:
-        if self.cycle is None and not self.transport.is_closing():
-            self.transport.close()
+    def handle_events(self) -> None:
+        """Read; from the headers of a request on, there is time for its body and answer, and to take that."""
+        before = self.cycle
+        super().handle_events()
+        if self.cycle is not before:
+            self._allow(2.0 * self._limits.request_s)  # `Guard` answers before that
+
+    def on_response_complete(self) -> None:
+        """Begin to wait for the next request."""
+        self.waits_since = self.loop.time()
+        self._allow(self._limits.request_s)
+        super().on_response_complete()
+
+    @property
+    def waits(self) -> bool:
+        """Whether the service waits for the client, to send a request or to take an answer."""
+        c = self.cycle
+        return c is None or c.response_complete or c.more_body or self.flow.write_paused
+
+    def cut(self) -> None:
+        """End the connection, whatever the client has not taken yet."""
+        self.connections.discard(self)
+        self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop waiting."""
         self._deadline.cancel()
         super().connection_lost(exc)
+
+    def _allow(self, seconds: float) -> None:
+        self._deadline.cancel()
+        self._deadline = self.loop.call_later(seconds, self.cut)
+
+    def _make_room(self) -> None:
+        """Cut what has waited longest while there are too many, of the addresses that have most connections."""
+        while True:
+            held = cast("set[BoundedProtocol]", self.connections)
+            counts = Counter(c.address for c in held)
+            crowded = counts[self.address] > self._limits.of_one_address
+            if not crowded and len(held) <= self._limits.open_at_once:
+                return
+            waiting = [c for c in held if c.waits and (c.address == self.address or not crowded)]
+            if not waiting:  # all are being answered, and `Guard` bounds those
+                return
+            min(waiting, key=lambda c: (-counts[c.address], c.waits_since)).cut()
+
+
+def _network(address: str) -> str:
+    """Return an address; of one of IPv6 the half that its owner cannot choose."""
+    found = ipaddress.ip_address(address)
+    if isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is None:
+        return str(ipaddress.IPv6Network((int(found), 64), strict=False))
+    return address

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import uvicorn
 from uvicorn.supervisors import Multiprocess
@@ -14,7 +16,10 @@ from uvicorn.supervisors import Multiprocess
 from list3r.catalog import Catalog
 from list3r.memory.errors import OptionError
 from list3r.service.app import CATALOG_VARIABLE, SECRET_VARIABLE, TIMEOUT_VARIABLE
-from list3r.service.limits import BoundedProtocol, ServiceLimits
+from list3r.service.limits import Application, BoundedProtocol, ServiceLimits
+
+_BACKLOG = 128
+"""Connections that wait to be taken, and are taken at once."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +46,27 @@ def serve(
     Catalog.open(catalog, make=False).close()  # what is wrong with it is said here, and once
     os.environ |= {CATALOG_VARIABLE: catalog, SECRET_VARIABLE: secret, TIMEOUT_VARIABLE: str(limits.request_s)}
     listener = _listen(address.host, address.port)
-    config = uvicorn.Config(
-        "list3r.service.app:from_environment",
-        factory=True,
-        http=BoundedProtocol,
-        ws="none",
-        workers=address.workers,
-        log_level="warning",
-        limit_concurrency=limits.at_once,
-        timeout_keep_alive=math.ceil(limits.request_s),
-        timeout_graceful_shutdown=math.ceil(limits.request_s),
-        server_header=False,
-    )
+    config = server_config("list3r.service.app:from_environment", limits, factory=True, workers=address.workers)
     started(f"http://{address.host}:{listener.getsockname()[1]}/v1")
     if address.workers == 1:
         uvicorn.Server(config).run(sockets=[listener])
     else:
         Multiprocess(config, sockets=[listener]).run()
+
+
+def server_config(app: str | Application, limits: ServiceLimits, **words: Any) -> uvicorn.Config:
+    """Return how uvicorn serves an application within limits."""
+    return uvicorn.Config(
+        app,
+        http=functools.partial(BoundedProtocol, limits=limits),  # type: ignore[arg-type]
+        ws="none",
+        log_level="warning",
+        backlog=_BACKLOG,
+        timeout_keep_alive=math.ceil(limits.request_s),
+        timeout_graceful_shutdown=math.ceil(limits.request_s),
+        server_header=False,
+        **words,
+    )
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -68,6 +77,6 @@ def _listen(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listener.close()
         raise OptionError(f"--host {host} --port {port} cannot be served: {error}; name another") from error
-    listener.listen(128)
+    listener.listen(_BACKLOG)
     listener.set_inheritable(True)
     return listener

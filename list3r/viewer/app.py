@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -47,13 +49,16 @@ class Viewer:
     def __init__(self, memory: SceneMemory, settings: ViewerSettings | None = None) -> None:
         self.memory, self.settings = memory, settings or ViewerSettings()
         self._lock = threading.RLock()
-        self._asked: list[ViewState] = []
+        self._asked: deque[ViewState] = deque(maxlen=1)
+        """Of the link that was opened last, until its page connects: all pages show the same."""
+        self._dropped = False
+        """Whether another link was opened before that one's page connected."""
         self._measuring: list[tuple[int, NDArray[np.float64]]] | None = None
         self._pages: dict[int, PageClouds] = {}
         self._drawn: Shown | None = None
         self.state = ViewState()
         self.path = read_path(memory)
-        self.world = self._read()
+        self.world = self._read(None)
         self.picked: ShownCloud = self.world.cloud
         """The points that a click can meet."""
         self.server = start_server(self.settings.port, f"list3r {memory.path.name}", self._page_opened)
@@ -77,23 +82,23 @@ class Viewer:
 
     # ------------------------------------------------------------------ what is shown
 
-    def _read(self) -> ShownWorld:
-        session = self.state.session
+    def _read(self, session: int | None) -> ShownWorld:
         sessions = [s.session_id for s in self.memory.sessions()]
-        if session is None or not sessions or session >= sessions[-1]:
+        if session is None or session in sessions[-1:]:
             return read_world(self.memory, self.memory.changes())
         with open_scene(self.memory.path, at=session) as before:
             changes = [c for c in self.memory.changes() if c.event.session_id == session]
             return read_world(before, changes)
 
     def show(self, **changed: Any) -> None:
-        """Change what is shown: fields of `ViewState`."""
+        """Change what is shown: fields of `ViewState`. Raises `List3rError`, and nothing changes, where the memory as
+        it was after a session cannot be read.
+        """
         with self._lock:
-            before, self.state = self.state, replace(self.state, **changed)
-            if before.session != self.state.session:
-                self.world = self._read()
-            if self.state.selected not in self.world.instances:
-                self.state = replace(self.state, selected=None)
+            before, wanted = self.state, replace(self.state, **changed)
+            world = self.world if wanted.session == before.session else self._read(wanted.session)
+            self.world = world
+            self.state = wanted if wanted.selected in world.instances else replace(wanted, selected=None)
             if before != self.state:
                 self.draw()
                 self.panel.follow(self.state)
@@ -101,7 +106,7 @@ class Viewer:
     def reload(self) -> None:
         """Read the memory again, after an edit."""
         with self._lock:
-            self.world = self._read()
+            self.world = self._read(self.state.session)
             if self.state.selected not in self.world.instances:
                 self.state = replace(self.state, selected=None)
             self.draw()
@@ -211,17 +216,37 @@ class Viewer:
     # ------------------------------------------------------------------ events
 
     def _page_opened(self, code: str) -> None:
-        self._asked.append(ViewState.decode(code))
+        view = ViewState.decode(code)
+        self._dropped |= bool(self._asked) and self._asked[-1] != view
+        self._asked.append(view)
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        if self._asked:
-            self.show(**vars(self._asked.pop()))
+        with contextlib.suppress(IndexError):
+            self._follow(self._asked.pop())
         names = PageNames(client, self.settings.names)
         page = self._pages[client.client_id] = PageClouds(client, self.settings.clouds, names)
         client.camera.on_update(page.moved)
         if self._drawn is not None:
             page.draw(self._drawn)
         names.draw(self.world, self.state.selected, visible=self.state.labels)
+
+    def _follow(self, view: ViewState) -> None:
+        """Show what a link names, as far as this memory has it, and say what is left out."""
+        left_out = []
+        if self._dropped:
+            self._dropped = False
+            left_out.append("Several links were opened at once; the last one is shown.")
+        if view.session is not None and view.session not in [s.session_id for s in self.memory.sessions()]:
+            left_out.append(f"This memory has no session {view.session}, which the link names.")
+            view = replace(view, session=None)
+        try:
+            self.show(**vars(view))
+        except List3rError as error:
+            left_out.append(f"The link cannot be followed: {error}.")
+        else:
+            if view.selected != self.state.selected:
+                left_out.append(f"There is no thing {view.selected}, which the link names.")
+        self.panel.say(" ".join(left_out))
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         origin, direction = np.asarray(event.ray_origin, np.float64), np.asarray(event.ray_direction, np.float64)

@@ -7,9 +7,12 @@ import binascii
 import json
 from dataclasses import asdict, dataclass, fields
 
+from list3r.memory.unpacking import parse_json
 from list3r.viewer.world import COLOR_MODES
 
 _LONGEST = 2000
+_LARGEST = 2**63 - 1
+"""Number of an instance or a session."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class ViewState:
         """Return the view of a code; what a code says that makes no sense is as usual."""
         try:
             padded = code[:_LONGEST] + "=" * (-len(code[:_LONGEST]) % 4)
-            given = json.loads(base64.urlsafe_b64decode(padded))
+            given = parse_json(base64.urlsafe_b64decode(padded))
         except (ValueError, binascii.Error):
             return ViewState()
         if not isinstance(given, dict):
@@ -49,5 +52,5 @@ class ViewState:
 
 def _sound(name: str, value: object) -> bool:
     if name in ("selected", "session"):
-        return isinstance(value, int) and not isinstance(value, bool)
+        return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _LARGEST
     return value in COLOR_MODES if name == "colors" else isinstance(value, bool)

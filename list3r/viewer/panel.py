@@ -120,7 +120,10 @@ class Panel:
 
     def _show(self, **changed: Any) -> None:
         if not self._following:
-            self._viewer.show(**changed)
+            try:
+                self._viewer.show(**changed)
+            except List3rError as error:
+                self.say(str(error))
 
     def _times(self) -> None:
         sessions = [s.session_id for s in self._viewer.memory.sessions()]

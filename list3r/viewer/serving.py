@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import http
 import io
-import re
 from collections.abc import Callable, Iterator
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request
 
 HOST = "127.0.0.1"
-_OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?")
+_PAGES = frozenset(("document", "iframe"))
+"""What a browser calls a request that opens a page, not a picture or a script of another one."""
 
 
 def start_server(port: int, title: str, asked_for: Callable[[str], None]) -> viser.ViserServer:
@@ -36,24 +39,43 @@ def quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded(asked_for: Callable[[str], None]) -> Iterator[None]:
-    """While a server starts: it answers web sockets of its own pages only. viser has no such option, and without it any
-    web site open in the same browser could read and edit the memory.
+    """While a server starts: it answers its own page only, by its own host and port. viser has no such option, and
+    without it any page of another site or server open in the same browser could read and edit the memory.
     """
     serve = websockets.asyncio.server.serve
 
-    def guarded(*args: Any, **words: Any) -> Any:
-        answer = words.pop("process_request", None)
+    def guarded(*args: Any, process_request: Callable[[ServerConnection, Request], Any], **words: Any) -> Any:
+        # `wraps`: websockets asks whether it is a coroutine function
+        @functools.wraps(process_request)
+        def process(connection: ServerConnection, request: Request) -> Any:
+            refused = _refusal(request, f"{HOST}:{connection.local_address[1]}")
+            if refused is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, refused)
+            answer = process_request(connection, request)
+            if answer is not None:
+                answer.headers["Content-Security-Policy"] = f"frame-ancestors http://{HOST}:*"
+            if set(request.headers.get_all("Sec-Fetch-Dest")) <= _PAGES:
+                for code in parse_qs(request.path.partition("?")[2]).get("view", [])[-1:]:
+                    asked_for(code)
+            return answer
 
-        @functools.wraps(answer or guarded)
-        def process(connection: Any, request: Any) -> Any:
-            for code in parse_qs(urlsplit(request.path).query).get("view", []):
-                asked_for(code)
-            return None if answer is None else answer(connection, request)
-
-        return serve(*args, **words, process_request=process, origins=[_OWN_PAGES])
+        return serve(*args, **words, process_request=process)
 
     websockets.asyncio.server.serve = guarded  # type: ignore[assignment,misc]
     try:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _refusal(request: Request, own: str) -> str | None:
+    """Return why a request is not answered, None for one of the server's own page.
+
+    The name of the host counts, too: another server of this machine may have the same port under the name localhost.
+    """
+    origins = request.headers.get_all("Origin")
+    if request.headers.get_all("Host") != [own] or (
+        (origins or "Upgrade" in request.headers) and origins != [f"http://{own}"]
+    ):
+        return f"This viewer answers at http://{own} only; open that address.\n"
+    return None

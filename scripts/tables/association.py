@@ -32,8 +32,8 @@ def kitchen() -> str:
 
 
 VARIANTS = {
-    "vggt-long": "VGGT-Long and Pi-Long, their own loop selection, alignment and optimiser; no cut detection",
-    "vggt-long-cuts": "the same, cuts given (as in all rows below)",
+    "vggt-long": "VGGT-Long and Pi-Long as published, no cut detection",
+    "vggt-long-cuts": "the same, cuts given (as in the rows below)",
     "ilrd-paper": "loops by `s_loop` alone, as in the paper",
     "verified": "loops by frame similarity, verified by geometry, no instances",
     "ilrd": "+ instances rank, veto and register (ILRD)",
@@ -102,11 +102,11 @@ def returns() -> str:
 
 
 def registration() -> str:
-    """Return the table of registration by things alone."""
+    """Return the table of registration by instances alone."""
     names = {
         "opposite": "from the opposite end of the room",
         "opposite-sensor": "the same, depth sensor",
-        "moved": "half of the things moved, different light",
+        "moved": "half of the objects moved, different light",
         "alike": "one of three rooms that look alike",
     }
     rows = []
@@ -117,7 +117,7 @@ def registration() -> str:
         off = f"{t['median_m']:.2f}, {t['median_deg']:.1f}"
         rows.append([name, *cells, off, f"{t['within_0.1_m_and_3_deg']} of {t['joined']}"])
     heads = ["homes joined", "with a wrong relation", "accepted relations, wrong ones", "median error (m, degrees)"]
-    return table(["registration by things alone, held-out homes", *heads, "within 0.1 m and 3 degrees"], rows)
+    return table(["registration by instances alone, held-out homes", *heads, "within 0.1 m and 3 degrees"], rows)
 
 
 def changed() -> str:

@@ -1,4 +1,4 @@
-"""Tables of what is found, of relations and of changes."""
+"""Tables of instances, of relations and of changes."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def discovery() -> str:
     ablation of the networks' inputs.
     """
     methods = {"geometric": "rules (removed since)", "learned": "learned (default)", "true": "true masks"}
-    methods["before"] = "learned, with the weights before decision 0179"
-    methods["before 0199"] = "learned, depth by matches alone, before decision 0199"
+    methods["before"] = "learned, former weights (before 0179)"
+    methods["before 0199"] = "learned, depth by matches alone (before 0199)"
     places = {
         "discovery": "10 held-out worlds",
         "discovery-fitted": "6 held-out rooms with built-in furniture",
@@ -76,7 +76,7 @@ def memories() -> str:
         "discovery-memory-long-fitted": "4 held-out rooms with built-in furniture",
         "discovery-memory-long-house": "house modelled by others, 6 walks",
     }
-    names = {"learned": "now", "before 0205": "the version before decision 0205, from the same chunks"}
+    names = {"learned": "now", "before 0205": "before 0205, from the same chunks"}
     rows = []
     for file, place in places.items():
         for method, entry in read(file)["mean"].items():
@@ -85,7 +85,7 @@ def memories() -> str:
                 for kind in ("", "mask_")
                 for iou in ("0.25", "0.5")
             ]
-            rows.append([f"{place}, {entry['things']} things: {names[method]}", *cells])
+            rows.append([f"{place}, {entry['things']} objects: {names[method]}", *cells])
     head = ["boxes at IoU 0.25", "at 0.5", "masks at 0.25", "masks at 0.5"]
     return table(["recall, precision of memories of six chunks", *head], rows)
 

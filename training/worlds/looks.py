@@ -1,6 +1,6 @@
 """Looks that a palette of clean materials lacks: wear and prints of all scales, gloss that shows the room, exposure.
 
-Depth from pictures must not take what a glossy front shows for a place behind it (decision 0198).
+Depth from pictures must not take what a glossy front shows for a place behind it (research/colour-video 0198).
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class NodeSettings:
     measured_share: float = 0.3
     """Share of the measured change of relation along overlaps that is taken as a random walk of the chunks: errors
     of single frames are in it, and bending grows slower than a walk does. Chosen among 0.03 to 3, see
-    docs/decisions/0043."""
+    research/association 0043."""
     shift_walk: float = 1e-4
     """Deviation of the shift that a frame adds beyond what overlaps show, as a share of the depth: chunks of the same
     depth images err alike, and do not see it."""

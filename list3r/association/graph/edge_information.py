@@ -1,6 +1,7 @@
 """The information matrix of each edge of the graph, from its covariance and the bending of chunks.
 
-The paper weighs edges by their confidence instead (A.4): `benchmarks/peers/graph_weights.py`, docs/decisions/0041.
+The paper weighs edges by their confidence instead (A.4): `benchmarks/peers/graph_weights.py`, research/association
+0041.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class TrustSettings:
     """Degrees of freedom that support the stated errors of edges."""
     anneal_step: float = 1.6
     """Factor by which the kernel tightens from stage to stage of the annealing; larger ones lose true edges, see
-    docs/decisions/0042."""
+    research/association 0042."""
     rounds: int = 8
     """Most times that errors are scaled and edges judged again."""
     iterations: int = 20

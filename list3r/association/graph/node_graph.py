@@ -4,7 +4,7 @@ every 50 frames).
 The graph of chunks (`pose_graph`) decides which edges are believed. Here every chunk is cut into nodes (`chunk_nodes`);
 neighbouring nodes are tied as stiffly as the overlaps show that chunks are, nodes of two chunks by the frames that both
 hold, and loops hold the nodes of the frames that they were found at. The same solver places all nodes; their mean
-places the chunk, and what is left is the chunk's bend. What it gains: docs/decisions/0043.
+places the chunk, and what is left is the chunk's bend. What it gains: research/association 0043.
 """
 
 from __future__ import annotations

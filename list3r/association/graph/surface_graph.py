@@ -1,8 +1,8 @@
 """Place chunks of structure from motion a second time, for their instances: by depth instead of camera paths.
 
-A path of a few decimetres tells the scale of a chunk worse than its depth does (docs/decisions/0044). Neighbours are
-tied by the cameras' directions and the ratio of the depths of shared frames, loops as they are. The cameras stay where
-their graph has them; the difference is part of each chunk's bend.
+A path of a few decimetres tells the scale of a chunk worse than its depth does (research/association 0044). Neighbours
+are tied by the cameras' directions and the ratio of the depths of shared frames, loops as they are. The cameras stay
+where their graph has them; the difference is part of each chunk's bend.
 """
 
 from __future__ import annotations

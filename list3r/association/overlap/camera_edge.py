@@ -1,7 +1,7 @@
 """Measure the relation of two chunks by the cameras of the frames that they share.
 
-Structure from motion places cameras far better than surfaces (docs/decisions/0048). The path must be long enough to
-tell the scale; otherwise the edge by points stays.
+Structure from motion places cameras far better than surfaces (research/association 0048). The path must be long enough
+to tell the scale; otherwise the edge by points stays.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Find frames that look alike: exact search over the descriptors of all keyframes (docs/decisions/0047)."""
+"""Find frames that look alike: exact search over the descriptors of all keyframes (research/association 0047)."""
 
 from __future__ import annotations
 

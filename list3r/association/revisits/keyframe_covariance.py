@@ -3,7 +3,7 @@
 Pairs of two depth images are many and their errors are not independent: depth errs alike over a neighbourhood, and an
 error of the calibration turns or stretches whole images. So the information of the pairs counts as that of a few cells
 of the picture, and a part that all pairs share is added, about the camera. It is the larger part by far
-(docs/decisions/0046).
+(research/association 0046).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@
 4. A relation that the chain of accepted edges contradicts is refused (`chain`).
 
 Every candidate becomes an edge, accepted or not, with its scores and the reason. How the weights were chosen:
-docs/decisions/0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as the paper writes it.
+research/association 0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as the paper writes it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class RevisitSettings:
     """How revisits are found."""
 
     lambda_: float = 0.5
-    """Weight of frame similarity in s_loop (the paper gives none), which ranks candidates (docs/decisions/0149)."""
+    """Weight of frame similarity in s_loop (the paper gives none), which ranks candidates (research/association
+    0149)."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
     enough: int = 8
@@ -75,7 +76,7 @@ class RevisitSettings:
     seconds each and find little more (redkitchen)."""
     of_networks: int = 3
     """The same where a network makes the chunks: three passes over 40 frames are about what the chunk itself took, and
-    a network relates views that share too little for features (docs/decisions/0151)."""
+    a network relates views that share too little for features (research/association 0151)."""
     most_ambiguous: float = 2.0
     """Relations that agree on where a part of the video lies that nothing tied to the rest before, for each one that
     says otherwise."""
@@ -278,7 +279,7 @@ class RevisitSearch:
         return max(accepted, key=lambda e: (e.confidence, -e.u), default=None)
 
     def second_looks(self, edge: Edge, known: Container[tuple[int, int] | None]) -> list[Edge]:
-        """Return relations of further keyframes of two chunks, until one more is accepted (docs/decisions/0056).
+        """Return relations of further keyframes of two chunks, until one more is accepted (research/sessions 0056).
 
         The edge only decides which keyframes are compared: each pair is compared as if nothing were known.
         """
@@ -295,7 +296,7 @@ class RevisitSearch:
 
     def by_all_keyframes(self, edges: Sequence[Edge]) -> list[Edge]:
         """Return the edges with those that all keyframes find to other sessions, where frames that look alike do not
-        place this one (docs/decisions/0134). What they contradict is rejected, what they find again replaced."""
+        place this one (research/sessions 0134). What they contradict is rejected, what they find again replaced."""
         s, here, session = self._settings, self._rows[self._id], {k: r.session_id for k, r in self._rows.items()}
         others = [e for e in edges if session[e.u] != here.session_id and self._apart(e.u)]
         alike = sorted(others, key=lambda e: (not e.accepted, -e.scores.get("s_det", 0.0), e.u))

@@ -1,7 +1,7 @@
 """Which further keyframes of two chunks are worth a comparison, where a single relation ties a session to another.
 
 A short session has few chunks, and frames of a changed room in another light propose few pairs. One relation alone does
-not place a session; but it says which other keyframes should see the same (docs/decisions/0056).
+not place a session; but it says which other keyframes should see the same (research/sessions 0056).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart)
     """Tell whether two relations of two sessions support each other.
 
     Those of one pair of chunks do where their frames lie apart, or where one is by frames and the other by things.
-    Those of two pairs do not where they share a keyframe: what misled one misleads the other (docs/decisions/0058).
+    Those of two pairs do not where they share a keyframe: what misled one misleads the other (research/sessions 0058).
     `session_of` gives the session of every chunk.
     """
     one_pair = (e.u, e.v) == (f.u, f.v)

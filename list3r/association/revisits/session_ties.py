@@ -2,12 +2,12 @@
 
 Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart, or one
 is by frames and one by things. One is beyond doubt when many features hold it, or when the whole of both chunks speaks
-for it (docs/decisions/0134).
+for it (research/sessions 0134).
 
 Within one video neighbouring chunks share frames, and a false loop is caught by the chain. Nothing catches a false
 relation that alone ties one session to another: the whole session would land on top of the old world in a wrong place.
 Such a relation is held back, which is said in its reason, until another agrees with it or a later session connects the
-two (docs/decisions/0049).
+two (research/sessions 0049).
 """
 
 from __future__ import annotations

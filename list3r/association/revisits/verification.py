@@ -39,7 +39,7 @@ class VerificationSettings:
         )
     )
     """Features begin within some centimetres: a wider gate takes the wall for the picture that hung before it
-    (docs/decisions/0058)."""
+    (research/sessions 0058)."""
     scaled_registration: RegistrationSettings = field(
         default_factory=lambda: RegistrationSettings(photometric_weight=0.0, gate_m=0.15, iterations=20)
     )

@@ -107,7 +107,7 @@ class VideoMapSettings:
         )
     )
     """Rougher than a chunk's, since all is adjusted afterwards; grown again only where depth jumps: by 17 in a walk of
-    wide turns that was bent, by 1.7 at most on redkitchen (decision 0128)."""
+    wide turns that was bent, by 1.7 at most on redkitchen (research/colour-video 0128)."""
     joining: JoiningSettings = field(default_factory=JoiningSettings)
     """Of maps of its parts."""
     revisits: RevisitPairSettings = field(default_factory=RevisitPairSettings)

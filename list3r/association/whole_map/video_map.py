@@ -1,4 +1,4 @@
-"""One map of a whole video of wide steps, before its chunks (decision 0074).
+"""One map of a whole video of wide steps, before its chunks (research/colour-video 0074).
 
 Frames are followed and matched with those ahead, and mapped in one go; then frames that see the same again are sought,
 drift is spread over the way between them, and all is adjusted together.

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, in_column, open_memory, print_table
 from list3r.cli.terminal import note
 
 
@@ -42,7 +42,7 @@ def changes(
                 c.event.session_id,
                 c.instance.id,
                 c.event.kind.replace("_", " "),
-                c.instance.label or c.instance.description,
+                in_column(c.instance.label or c.instance.description),
                 _place(c.event.from_box),
                 _place(c.event.to_box),
                 c.score,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, in_column, open_memory, print_table
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def list_instances(
     rows = [
         [
             i.id,
-            i.label or i.description,
+            in_column(i.label or i.description),
             _triple(i.center),
             _triple(i.box.size),
             i.confidence,

@@ -9,7 +9,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask.memory import instance_dict
-from list3r.cli.common import print_table
+from list3r.cli.common import in_column, print_table
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def print_matches(matches: Sequence[Match], units: str, json: bool, **facts: Any
     rows = [
         [
             m.instance.id,
-            m.instance.label or m.instance.description,
+            in_column(m.instance.label or m.instance.description),
             m.score,
             *((_length(m.distance_m), _length(m.center_distance_m)) if placed else ()),
             "" if m.best_view is None else m.best_view.frame_index,
@@ -130,7 +130,7 @@ def print_matches(matches: Sequence[Match], units: str, json: bool, **facts: Any
 
 def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
     """Relations with what can be said of the question as a whole."""
-    names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
+    names = {i.id: in_column(i.label or i.description) for i in scene.instances(structure=None)}
     gravity, units = scene.gravity, scene.units
     if json:
         notes = [found.reason] if found.reason else []

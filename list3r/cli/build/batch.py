@@ -92,7 +92,8 @@ def batch(
     Example: list3r batch walks/ --out memories/
     """
     groups = _read(videos, given, request, run)
-    from list3r.batch.engines.base import TaskResources, make_engine  # after a list that may be refused
+    from list3r.batch.engines.base import TaskResources  # after a list that may be refused
+    from list3r.batch.engines.choice import make_engine
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
     from list3r.memory.errors import OptionError

@@ -39,6 +39,7 @@ def inspect(
     from list3r.exporters.output import replacing
     from list3r.frames.inspection import SourceReport, draw_registration
     from list3r.frames.pose_agreement import disagreements
+    from list3r.frames.quick_look import unusable
     from list3r.frames.source import open_source
 
     options = given.options(more)
@@ -54,7 +55,7 @@ def inspect(
     if overlay is not None:
         with replacing(overlay) as temporary:
             draw_registration(opened, temporary)
-    report = SourceReport(opened.info, found, overlay, disagreements(opened))
+    report = SourceReport(opened.info, found, overlay, unusable(opened), disagreements(opened))
     if json:
         print_answer([report.as_dict()])
     else:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.bar import ProgressBar, progress_bar
-from list3r.cli.terminal import note, say
+from list3r.cli.bar import progress_bar
+from list3r.cli.terminal import ProgressBar, note, say
 from list3r.pipeline.request import Watch
 
 if TYPE_CHECKING:
@@ -102,11 +102,21 @@ def report_lines(memory: Path, report: BuildReport) -> list[str]:
 
 
 def build_interrupted(memory: Path, resumed: bool) -> Callable[[bool], str]:
-    """Return what is said when a build is interrupted."""
+    """Return what is said when a build that is about to begin is interrupted."""
+    before = _inode(memory)
 
     def said(begun: bool) -> str:
         if (begun or resumed) and memory.exists():
             return f"interrupted; {memory} keeps the finished chunks: continue with the same command and --resume"
-        return "interrupted before a chunk was finished; nothing was changed"
+        early = "interrupted before a chunk was finished"
+        if _inode(memory) == before:
+            return f"{early}; nothing was changed"
+        aside = f"{memory}.replaced"
+        kept = f"; what was there before is {aside}" if before is not None and _inode(Path(aside)) == before else ""
+        return f"{early}; {memory} is left and holds nothing yet: remove it, or give --resume to go on{kept}"
 
     return said
+
+
+def _inode(path: Path) -> int | None:
+    return path.stat().st_ino if path.exists() else None

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import asked_at, parse_point, print_table
+from list3r.cli.common import asked_at, in_column, parse_point, print_table
 from list3r.cli.terminal import note
 
 if TYPE_CHECKING:
@@ -160,12 +160,13 @@ _RELATIONS = ("memory", "id", "subject", "predicate", "id", "object", "conf", "f
 
 
 def _match_row(m: Any) -> list[object]:
-    what = m.label or m.description
+    what = in_column(m.label or m.description)
     return [m.memory, m.id, what, m.score, "" if m.distance is None else f"{m.distance:.3f}", m.path, m.reason]
 
 
 def _relation_row(r: Any) -> list[object]:
-    return [r.memory, r.subject, r.subject_name, r.predicate, r.object, r.object_name, r.confidence, r.path]
+    subject, object = in_column(r.subject_name), in_column(r.object_name)
+    return [r.memory, r.subject, subject, r.predicate, r.object, object, r.confidence, r.path]
 
 
 def _print(

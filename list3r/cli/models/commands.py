@@ -131,7 +131,7 @@ def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
         "part": card.part,
         "about": card.about,
         "installed": missing_package(card) is None,
-        "install": card.install,
+        "install": card.installed_by,
         "code_licence": card.code.name,
         "repository": None if weights is None else weights.repository,
         "revision": None if weights is None else weights.revision,

@@ -1,151 +1,360 @@
-"""Draw the map of a plan view: what was seen, boxes, tracks, loop closures, the camera path and the tags."""
+"""Draw a plan view with matplotlib: walls, instances with their ids, the camera path, a grid and a legend."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.colors
+import matplotlib.font_manager
+import matplotlib.patheffects
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from PIL import Image
 
-from list3r.exporters.components import Component
-from list3r.exporters.palette import Color
-from list3r.exporters.plan.frame import is_wall
-from list3r.exporters.plan.labels import TagTarget, place_tags
-from list3r.exporters.plan.map import hatched, pale_picture
-from list3r.exporters.plan.sheet import GREY, INK, OVERSAMPLING, Sheet
-from list3r.memory.records import Instance, Support
+from list3r.exporters.components import Component, component_files, has_box, thinned_support
+from list3r.exporters.output import units, write_together
+from list3r.exporters.palette import instance_color
+from list3r.exporters.plan.loops import loop_ends
+from list3r.exporters.plan.raster import picture_from_above
+from list3r.exporters.plan.view import PlanView, choose_view, is_wall
+from list3r.exporters.tags import TagTarget, place_tags
+from list3r.memory.description.printable import shown
+from list3r.memory.errors import OptionError
+from list3r.memory.records import Instance
+from list3r.memory.store.store import Store
 
-_START: Color = (22, 140, 100)
-_END: Color = (196, 48, 72)
-_WORD_PX = (56, 18)
-"""Room that the word of a mark takes; ends of a path that are nearer have their words on two sides."""
-_LOOP: Color = (118, 84, 190)
+_INK, _GREY, _LINE = "#262a34", "#787c86", "#cdcfd4"
+_START, _END, _LOOP = "#168c64", "#c43048", "#7654be"
+_STYLE: Any = {"font.family": "sans-serif", "svg.fonttype": "none", "svg.hashsalt": "list3r", "hatch.linewidth": 0.5}
+_DPI = 100
+_EDGE_PX, _HEAD_PX, _FOOT_PX, _ROW_PX, _COLUMN_PX = 56, 84, 74, 22, 480
+"""Rim of the page, room above the map for the title and below it for the axis, height of a row of the legend and the
+least width of its columns."""
 
 
-def draw_picture(sheet: Sheet, component: Component, supports: dict[int, Support]) -> None:
-    """Draw what was seen from above, in pale colours."""
-    up = sheet.frame.R_plan_world[2]
+@dataclass(frozen=True)
+class PlanSettings:
+    """How the picture is laid out."""
+
+    width_px: int = 1600
+    max_map_px: int = 1000
+    """Height of the map, at most."""
+    max_rows: int = 16
+    """Rows of a column of the legend, at most."""
+    max_tags: int = 80
+    """The instances seen most have tags; where there are more, the others are faint outlines."""
+    points_per_instance: int = 8000
+    """At most this many points of each instance are drawn,"""
+    points_of_instances: int = 10_000_000
+    """and of all together;"""
+    points_per_structure: int = 40000
+    """and of each floor, wall and the like."""
+
+    def __post_init__(self) -> None:
+        if self.width_px < 700:
+            raise OptionError(f"the picture is {self.width_px} px wide; at least 700 px are needed")
+
+
+def write_plan(store: Store, path: str | Path, settings: PlanSettings | None = None) -> tuple[Path, ...]:
+    """Write the plan view of every component as PNG or SVG, the main one to `path`. Returns the files written."""
+    kind = Path(path).suffix.lower().lstrip(".")
+
+    def write(component: Component, to: Path) -> None:
+        with mpl.rc_context(_STYLE):
+            figure = plan_figure(store, component, settings)
+            figure.savefig(to, format=kind, dpi=_DPI, metadata={"Date": None} if kind == "svg" else None)
+
+    return write_together(component_files(store, path), write)
+
+
+def plan_figure(store: Store, component: Component, settings: PlanSettings | None = None) -> Figure:
+    """Draw the plan view of one component; coordinates of its map are those of the page (`PlanView.on_page`)."""
+    s = settings or PlanSettings()
+    share = s.points_of_instances // max(len(component.instances), 1)
+    limits = (min(s.points_per_instance, max(share, 1)), s.points_per_structure)
+    supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
+    view = choose_view(component, supports, store.facts.gravity)
+    instances = [i for i in component.instances if not i.structure and has_box(i)]
+    tagged = _seen_most(instances, s.max_tags)
+
+    page = _Page(view, s, len(instances))
+    ax = page.map
     seen = [i for i in component.instances if len(supports[i.id].points) and i.structure != "ceiling"]
-    walls = [supports[i.id] for i in seen if is_wall(i, up)]
-    floors = [supports[i.id] for i in seen if i.structure and not is_wall(i, up)]
-    things = [supports[i.id] for i in seen if not i.structure]
-    pixels = pale_picture(sheet.frame.reduced(OVERSAMPLING), things, floors, walls)
-    sheet.paste(Image.fromarray(np.round(hatched(pixels)).astype(np.uint8)))
-    bare = [i for i in component.instances if is_wall(i, up) and not len(supports[i.id].points)]
-    for instance in bare:
-        sheet.draw.polygon(sheet.footprint(instance), fill=(62, 68, 82, 200))
-    right, bottom = sheet.left + sheet.map_size[0] - 1, sheet.top + sheet.map_size[1] - 1
-    sheet.draw.rectangle((sheet.left, sheet.top, right, bottom), outline=(205, 207, 212), width=OVERSAMPLING)
+    walls = [i for i in seen if is_wall(i, view.R_plan_world[2])]
+    floors = [i for i in seen if i.structure and i not in walls]
+    layers = ([i for i in seen if not i.structure], floors, walls)
+    picture = picture_from_above(view, *([supports[i.id] for i in layer] for layer in layers))
+    ax.imshow(picture, extent=(view.low[0], view.high[0], view.low[1], view.high[1]), zorder=1)
+    draw_grid(ax, view, units(store))
+    _draw_boxes(ax, view, instances, {i.id for i in tagged})
+    _draw_tracks(ax, view, store, component)
+    _draw_loops(ax, view, loop_ends(store, component))
+    _draw_camera_path(ax, view, component)
+    _draw_tags(page, tagged)
+    remark = "" if len(tagged) == len(instances) else f"; the {len(tagged)} instances seen most have tags"
+    page.write((_EDGE_PX, 34), _title(store, component), size=17)
+    page.write((_EDGE_PX, 60), _subtitle(store, component), size=10, color=_GREY)
+    page.write((_EDGE_PX, page.below_map + 44), f"{view.note}; hatched: not seen{remark}", size=10, color=_GREY)
+    _draw_legend(page, instances, units(store))
+    return page.figure
 
 
-def draw_boxes(sheet: Sheet, things: list[Instance], tagged: set[int]) -> None:
+class _Page:
+    """A figure whose lengths are px from its upper left corner, with the axes of the map in it."""
+
+    def __init__(self, view: PlanView, settings: PlanSettings, rows: int) -> None:
+        width, span = settings.width_px, view.high - view.low
+        map_width = width - 2 * _EDGE_PX
+        map_height = float(np.clip(map_width * span[1] / span[0], 300, settings.max_map_px))
+        self.columns = max(1, map_width // _COLUMN_PX)
+        self.rows = min(-(-rows // self.columns), settings.max_rows)
+        self.below_map = _HEAD_PX + map_height
+        height = self.below_map + _FOOT_PX + (self.rows + 2.5) * _ROW_PX * bool(rows)
+        self.size = (width, round(height))
+        self.figure = Figure(figsize=(width / _DPI, self.size[1] / _DPI), dpi=_DPI, facecolor="white")
+        FigureCanvasAgg(self.figure)
+        place = (_EDGE_PX / width, 1 - self.below_map / self.size[1], map_width / width, map_height / self.size[1])
+        self.map = self.figure.add_axes(place)
+        half = np.array([map_width, map_height]) / 2 * max(span[0] / map_width, span[1] / map_height)
+        (left, bottom), (right, top) = (view.low + view.high) / 2 - half, (view.low + view.high) / 2 + half
+        self.map.add_patch(Rectangle((left, bottom), *(2 * half), hatch="//", fill=False, ec="#c4c8d0", lw=0, zorder=0))
+        self.map.set(xlim=(left, right), ylim=(bottom, top))
+        self.map.spines[:].set_color(_LINE)
+        self.view, self.pixels_per_unit = view, map_width / (right - left)
+
+    def write(self, xy: tuple[float, float], text: str, *, size: float, **how: Any) -> None:
+        """Write a text at a place of the page, px."""
+        place = (xy[0] / self.size[0], 1 - xy[1] / self.size[1])
+        how = {"color": _INK, "va": "center", **how}
+        self.figure.text(*place, text, fontsize=size, parse_math=False, **how)
+
+
+def draw_grid(ax: Axes, view: PlanView, unit: str) -> None:
+    """Mark world x and y where the page shows them, turned as it is; else lengths along the page."""
+    corners = np.array([(x, y) for x in ax.get_xlim() for y in ax.get_ylim()])
+    turn = view.R_plan_world[:2, :2] if view.shows_world_axes else np.eye(2)
+    left, bottom = ax.get_xlim()[0], ax.get_ylim()[0]
+    marks: dict[bool, list[tuple[float, str]]] = {False: [], True: []}
+    heads: dict[bool, str] = {}
+    for axis, name in enumerate("xy" if view.shows_world_axes else ("along the page", "up the page")):
+        across = turn[:, axis]  # of the page, in which this coordinate grows
+        rises = bool(abs(across[1]) > abs(across[0]))
+        values = corners @ across
+        along = np.array([-across[1], across[0]])
+        heads[rises] = f"{name}, {unit}"
+        for value in MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(values.min(), values.max()):
+            on, off = across * value, across * value + along
+            ax.axline((on[0], on[1]), (off[0], off[1]), color=_INK, lw=0.5, alpha=0.12, zorder=2)
+            edge = (value - across[0] * left) / across[1] if rises else (value - across[1] * bottom) / across[0]
+            marks[rises].append((edge, f"{value:g}"))
+    for rises, set_ticks, limits in ((False, ax.set_xticks, ax.get_xlim()), (True, ax.set_yticks, ax.get_ylim())):
+        inside = [(at, text) for at, text in marks[rises] if limits[0] <= at <= limits[1]]
+        set_ticks([at for at, _ in inside], [text for _, text in inside])
+    ax.tick_params(colors=_GREY, labelsize=8, color=_LINE)
+    ax.set_xlabel(heads[False], color=_GREY, fontsize=8, loc="right", labelpad=2)
+    ax.set_ylabel(heads[True], color=_GREY, fontsize=8, loc="top", labelpad=2)
+    if view.shows_world_axes:
+        ax.plot(0, 0, "+", color=_INK, ms=11, mew=1.3, zorder=6, scalex=False, scaley=False)
+
+
+def footprints(view: PlanView, instances: list[Instance]) -> NDArray[np.float64]:
+    """Return the outlines of boxes on the page, plan coordinates: six corners each, in order. Shape (N, 6, 2).
+
+    The shadow of a box is the sum of its three edges: they are walked by their direction, then back.
+    """
+    edges = np.array([i.box.rotation.T * i.box.size[:, None] for i in instances]).reshape(-1, 3, 3)
+    flat = view.on_page(edges)
+    flat *= np.where((flat[..., 1] < 0) | ((flat[..., 1] == 0) & (flat[..., 0] < 0)), -1.0, 1.0)[..., None]
+    order = np.argsort(np.arctan2(flat[..., 1], flat[..., 0]), axis=1)
+    steps = np.take_along_axis(flat, order[..., None], axis=1)
+    start = view.on_page(np.array([i.box.center for i in instances]).reshape(-1, 3)) - steps.sum(axis=1) / 2
+    return np.asarray(
+        start[:, None] + np.cumsum(np.concatenate([np.zeros_like(steps[:, :1]), steps, -steps[:, :2]], 1), 1)
+    )
+
+
+def _color(instance_id: int, alpha: float = 1.0) -> tuple[float, float, float, float]:
+    r, g, b = instance_color(instance_id)
+    return r / 255, g / 255, b / 255, alpha
+
+
+def _draw_boxes(ax: Axes, view: PlanView, instances: list[Instance], tagged: set[int]) -> None:
     """Draw oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
-    outlines = {i.id: sheet.footprint(i) for i in things}
-    for instance in sorted(things, key=lambda i: (-_area(outlines[i.id]), i.id)):
-        color, outline = sheet.color(instance.id), outlines[instance.id]
-        if instance.id not in tagged:
-            sheet.draw.line([*outline, outline[0], outline[1]], fill=(*color, 110), width=OVERSAMPLING)
+    if not instances:
+        return
+    outlines = footprints(view, instances)
+    order = np.argsort(-np.ptp(outlines, axis=1).prod(axis=1), kind="stable")
+    known = [instances[k].id in tagged for k in order]
+    ids = [instances[k].id for k in order]
+    edges = [_color(n, 1.0 if has else 0.4) for n, has in zip(ids, known, strict=True)]
+    fills = [_color(n, 0.12 if has else 0.0) for n, has in zip(ids, known, strict=True)]
+    widths = [1.6 if has else 0.7 for has in known]
+    ax.add_collection(
+        PolyCollection(list(outlines[order]), facecolors=fills, edgecolors=edges, linewidths=widths, zorder=3)
+    )
+
+
+def _draw_tracks(ax: Axes, view: PlanView, store: Store, component: Component) -> None:
+    """Draw where moving instances went: a dot where each was seen first, an arrow where last."""
+    for instance in (i for i in component.instances if i.dynamic):
+        places = store.tracks.of(instance.id)[1]
+        xy = view.on_page(places[np.isfinite(places).all(axis=1)])
+        if len(xy) < 2:
             continue
-        side_px = _area(outline) ** 0.5 / OVERSAMPLING
-        sheet.draw.polygon(outline, fill=(*color, int(np.interp(side_px, [20, 120], [60, 14]))))
-        sheet.draw.line([*outline, outline[0], outline[1]], fill=(*color, 255), width=2 * OVERSAMPLING)
+        color = _color(instance.id)
+        ax.plot(*xy.T, color=color, lw=2.2, zorder=4)
+        ax.plot(*xy[0], "o", color=color, ms=6, zorder=4)
+        arrow = {"arrowstyle": "->", "color": color, "lw": 2.2}
+        ax.annotate("", xy[-1], xy[-1 - max(1, len(xy) // 5)], arrowprops=arrow, zorder=4)
 
 
-def draw_tracks(sheet: Sheet, tracks: dict[int, NDArray[np.float64]]) -> None:
-    """Draw where moving things went, in their colours: a dot where each was seen first, an arrow where last."""
-    k = OVERSAMPLING
-    for instance_id, places in sorted(tracks.items()):
-        xy, color = sheet.px(places), sheet.color(instance_id)
-        points = [(float(x), float(y)) for x, y in xy]
-        if len(points) < 2:
-            continue
-        sheet.draw.line(points, fill=(*color, 230), width=3 * k, joint="curve")
-        (x, y), end = points[0], xy[-1]
-        sheet.draw.ellipse((x - 4 * k, y - 4 * k, x + 4 * k, y + 4 * k), fill=color)
-        back = xy[max(0, len(xy) - 1 - len(xy) // 5)] - end
-        back = back / max(float(np.linalg.norm(back)), 1e-9)
-        for side in (-0.5, 0.5):
-            turn = np.array([back[0] - side * back[1], back[1] + side * back[0]])
-            sheet.stroke(end, end + 12 * k * turn, color, 3)
-
-
-def draw_loops(sheet: Sheet, ends: NDArray[np.float64]) -> None:
+def _draw_loops(ax: Axes, view: PlanView, ends: NDArray[np.float64]) -> None:
     """Draw lines between cameras of the frames that closed a loop, (L, 2, 3), and what they are over the map."""
     if not len(ends):
         return
-    k = OVERSAMPLING
-    for a, b in zip(sheet.px(ends[:, 0]), sheet.px(ends[:, 1]), strict=True):
-        sheet.draw.line([(float(a[0]), float(a[1])), (float(b[0]), float(b[1]))], fill=(*_LOOP, 120), width=k)
-        for x, y in (a, b):
-            sheet.draw.ellipse((x - 2.5 * k, y - 2.5 * k, x + 2.5 * k, y + 2.5 * k), fill=(*_LOOP, 200))
-    words = f"{len(ends)} loop closure{'s' * (len(ends) > 1)}"
-    x, y = sheet.left + float(sheet.map_size[0]), 25.0 * k
-    start = x - sheet.draw.textlength(words, font=sheet.text_font) - 40 * k
-    sheet.draw.line([(start, y), (start + 32 * k, y)], fill=_LOOP, width=2 * k)
-    sheet.text((x, y), words, sheet.text_font, GREY, anchor="rm")
+    xy = view.on_page(ends)
+    ax.add_collection(LineCollection(list(xy), colors=_LOOP, linewidths=0.8, alpha=0.5, zorder=4))
+    ax.plot(*xy.reshape(-1, 2).T, ".", color=_LOOP, ms=4, alpha=0.8, zorder=4)
+    words = f"— {len(ends)} loop closure{'s' * (len(ends) > 1)}"
+    ax.text(1.0, 1.015, words, transform=ax.transAxes, ha="right", va="bottom", color=_LOOP, fontsize=9)
 
 
-def draw_camera_path(sheet: Sheet, component: Component) -> None:
+def _draw_camera_path(ax: Axes, view: PlanView, component: Component) -> None:
     """Draw where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""
-    sessions = sorted({frame.session_id for frame, _ in component.poses})
-    for session in sessions:
+    fade = mpl.colors.LinearSegmentedColormap.from_list("path", [_START, _END])
+    reach = 0.012 * float((view.high - view.low).max())
+    for session in sorted({frame.session_id for frame, _ in component.poses}):
         poses = [p for p in component.poses if p[0].session_id == session]
         frames = np.array([frame.frame_index for frame, _ in poses])
-        xy = sheet.px(np.stack([S_world_cam.translation for _, S_world_cam in poses]))
-        gaps = np.diff(frames) > 1.5 * np.median(np.diff(frames)) if len(frames) > 1 else np.zeros(0, bool)
-        for k in range(len(xy) - 1):
-            if not gaps[k]:
-                sheet.stroke(xy[k], xy[k + 1], _between(k / max(len(xy) - 1, 1)), 2)
-        for k in range(0, len(xy), max(1, len(xy) // 30)):
-            forward = sheet.frame.R_plan_world[:2] @ poses[k][1].rotation[:, 2]
-            tip = xy[k] + forward * [1.0, -1.0] * 13 * OVERSAMPLING
-            sheet.stroke(xy[k], tip, _between(k / max(len(xy) - 1, 1)), 1.5)
-        sheet.mark(xy[0], _START, "start", round_mark=True)
-        close = np.abs(xy[-1] - xy[0]) < np.array(_WORD_PX) * OVERSAMPLING
-        sheet.mark(xy[-1], _END, "end", round_mark=False, left=bool(close.all()))
+        xy = view.on_page(np.stack([S_world_cam.translation for _, S_world_cam in poses]))
+        steps = np.diff(frames)
+        joined = np.flatnonzero(steps <= 1.5 * np.median(steps)) if len(frames) > 1 else np.zeros(0, int)
+        lines = [xy[k : k + 2] for k in joined]
+        ax.add_collection(LineCollection(lines, colors=fade(joined / len(xy)), linewidths=1.6, zorder=5))
+        shown_at = np.arange(0, len(xy), max(1, len(xy) // 30))
+        looks = view.on_page(np.stack([poses[k][1].rotation[:, 2] for k in shown_at])) * reach
+        strokes = [(xy[k], xy[k] + look) for k, look in zip(shown_at, looks, strict=True)]
+        ax.add_collection(LineCollection(strokes, colors=fade(shown_at / len(xy)), linewidths=1.1, zorder=5))
+        close = bool(np.linalg.norm(xy[-1] - xy[0]) < 4 * reach)
+        for at, word, color, mark, side in (
+            (xy[0], "start", _START, "o", 1),
+            (xy[-1], "end", _END, "s", 1 - 2 * close),
+        ):
+            ax.plot(*at, mark, color=color, ms=9, mec="white", mew=1.5, zorder=7)
+            align = "left" if side > 0 else "right"
+            text = ax.annotate(word, at, (9 * side, 0), textcoords="offset points", color=color, ha=align, va="center")
+            text.set(fontsize=10, zorder=7, path_effects=_halo())
 
 
-def draw_tags(sheet: Sheet, things: list[Instance]) -> None:
-    """Draw the id of each thing on or beside it, a line to it where it is away, its name where there is room."""
-    k = OVERSAMPLING
-    anchors, names = [], []
-    for instance in things:
-        corners = np.array(sheet.footprint(instance))
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        (x, y), half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
-        width, name = sheet.chip_width(instance.id), sheet.name(instance).split(",")[0]
-        room = width + sheet.draw.textlength(name, font=sheet.text_font) + 8 * k
-        names.append(name if room < 1.8 * half[0] and half[1] > 20 * k else "")
-        anchors.append(TagTarget((x, y), (half[0], half[1]), (room if names[-1] else width, 18.0 * k)))
-    page = (
-        sheet.left + 4.0,
-        sheet.top + 4.0,
-        sheet.left + sheet.map_size[0] - 4.0,
-        sheet.top + sheet.map_size[1] - 4.0,
-    )
-    places = place_tags(anchors, page)
-    for anchor, place in zip(anchors, places, strict=True):
-        _leader(sheet, anchor, place)
-    for instance, anchor, name, (x, y) in zip(things, anchors, names, places, strict=True):
-        width = sheet.chip_width(instance.id)
-        left = x - anchor.tag[0] / 2
-        sheet.chip((left + width / 2, y), (width, anchor.tag[1]), instance.id)
-        sheet.text((left + width + 5 * k, y), name, sheet.text_font, INK, anchor="lm", halo=True)
+def _halo() -> list[mpl.patheffects.AbstractPathEffect]:
+    return [mpl.patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
-def _leader(sheet: Sheet, anchor: TagTarget, place: tuple[float, float]) -> None:
-    (x, y), k = anchor.xy, OVERSAMPLING
-    reach = (anchor.tag[0] / 2, anchor.tag[1] / 2) if anchor.small else anchor.half
-    if abs(place[0] - x) <= reach[0] and abs(place[1] - y) <= reach[1]:
+def _draw_tags(page: _Page, instances: list[Instance]) -> None:
+    """Draw the id of each instance on or near it, a line to it where it is away, its name where there is room."""
+    if not instances:
         return
-    sheet.draw.line([anchor.xy, place], fill=(*INK, 170), width=k)
-    sheet.draw.ellipse((x - 2 * k, y - 2 * k, x + 2 * k, y + 2 * k), fill=(*INK, 220))
+    ax, k = page.map, page.pixels_per_unit
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    targets, names = [], []
+    for instance, outline in zip(instances, footprints(page.view, instances), strict=True):
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        half = tuple((high - low) / 2 * k)
+        width, name = _tag_px(instance.id), _name(instance).split(",")[0]
+        room = width + 7.5 * len(name) + 8
+        names.append(name if room < 1.8 * half[0] and half[1] > 20 else "")
+        middle = (low + high) / 2
+        at = (float(middle[0] - left) * k, float(top - middle[1]) * k)
+        targets.append(TagTarget(at, (float(half[0]), float(half[1])), (room if names[-1] else width, 19.0)))
+    places = place_tags(targets, (3.0, 3.0, (right - left) * k - 3, (top - bottom) * k - 3))
+    for instance, target, name, (x, y) in zip(instances, targets, names, places, strict=True):
+        if abs(x - target.xy[0]) > target.half[0] or abs(y - target.xy[1]) > target.half[1]:
+            (x0, y0), (x1, y1) = target.xy, (x, y)
+            ends = np.array([(left + x0 / k, top - y0 / k), (left + x1 / k, top - y1 / k)])
+            ax.plot(*ends.T, color=_INK, lw=0.7, alpha=0.7, marker=".", markevery=[0], ms=4, zorder=7)
+        start = x - target.tag[0] / 2 + _tag_px(instance.id) / 2
+        _chip(ax.text(left + start / k, top - y / k, str(instance.id), zorder=9), instance.id)
+        if name:
+            at = (left + (start + _tag_px(instance.id) / 2 + 4) / k, top - y / k)
+            how: dict[str, Any] = {"fontsize": 10, "color": _INK, "va": "center", "zorder": 8, "path_effects": _halo()}
+            ax.text(*at, name, parse_math=False, **how)
 
 
-def _area(outline: list[tuple[float, float]]) -> float:
-    x, y = np.array(outline).T
-    return float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2)
+def _tag_px(instance_id: int) -> float:
+    return 9.0 + 8.0 * len(str(instance_id))
 
 
-def _between(share: float) -> Color:
-    r, g, b = (round(a + (z - a) * share) for a, z in zip(_START, _END, strict=True))
-    return r, g, b
+def _chip(text: mpl.text.Text, instance_id: int) -> None:
+    """Make a text the tag of an id."""
+    color = instance_color(instance_id)
+    ink = "white" if np.dot((0.3, 0.59, 0.11), color) < 165 else _INK
+    box = {"boxstyle": "round,pad=0.28", "fc": _color(instance_id), "ec": "white", "lw": 0.8}
+    text.set(fontsize=8.5, color=ink, ha="center", va="center_baseline", bbox=box)
+
+
+def _draw_legend(page: _Page, instances: list[Instance], unit: str) -> None:
+    """Write ids, names or descriptions and sizes below the map; where they are too many, those that were seen most."""
+    chosen = _seen_most(instances, page.columns * page.rows)
+    width = (page.size[0] - 2 * _EDGE_PX) / page.columns
+    top = page.below_map + _FOOT_PX
+    for column in range(page.columns):
+        rows = chosen[column * page.rows : (column + 1) * page.rows]
+        x, right = _EDGE_PX + column * width, _EDGE_PX + (column + 1) * width - 30
+        for n, instance in enumerate(rows):
+            y = top + (n + 1) * _ROW_PX
+            at = ((x + 18) / page.size[0], 1 - y / page.size[1])
+            _chip(page.figure.text(*at, str(instance.id)), instance.id)
+            size = " x ".join(f"{v:.2f}" if v < 10 else f"{v:.1f}" for v in instance.box.size)
+            room = int((right - x - 46 - 7 * len(size)) / 7)
+            name = _name(instance)
+            page.write((x + 46, y), name if len(name) <= room else name[: room - 1].rstrip() + "…", size=10)
+            page.write((right, y), size, size=10, color=_GREY, ha="right")
+        if rows:
+            page.write((x + 46, top), "name or description", size=9, color=_GREY)
+            page.write((right, top), f"size, {unit}", size=9, color=_GREY, ha="right")
+    if len(instances) > len(chosen):
+        words = f"and {len(instances) - len(chosen):,} more, seen in fewer frames"
+        page.write((_EDGE_PX + 46, top + (page.rows + 1) * _ROW_PX), words, size=9, color=_GREY)
+
+
+def _name(instance: Instance) -> str:
+    """Return the label of an instance; where there is none, or the font lacks its letters, its description."""
+    label = shown(instance.label or "")
+    font = mpl.font_manager.get_font(mpl.font_manager.findfont(mpl.font_manager.FontProperties()))
+    lacking = any(not font.get_char_index(ord(c)) for c in label)
+    description = shown(instance.description)
+    return description if not label or (lacking and description) else label
+
+
+def _seen_most(instances: list[Instance], limit: int) -> list[Instance]:
+    """Return at most this many instances, those with the most observations, by id."""
+    return sorted(sorted(instances, key=lambda i: (-i.observations, i.id))[:limit], key=lambda i: i.id)
+
+
+def _title(store: Store, component: Component) -> str:
+    extra = "" if component.main else f" (component {component.id}, not placed against the main one)"
+    return shown(store.path.name) + extra
+
+
+def _subtitle(store: Store, component: Component) -> str:
+    structure = [i.structure for i in component.instances if i.structure]
+    kinds = ", ".join(
+        f"{structure.count(k)} {k}{'s' * (structure.count(k) > 1)}"
+        for k in ("floor", "wall", "ceiling", "plane")
+        if k in structure
+    )
+    words = [
+        f"{len(component.instances) - len(structure):,} instances",
+        f"structure: {kinds}" if kinds else "no structure",
+        f"{len(component.poses):,} posed frames",
+        f"scale {(store.facts.scale_kind or 'relative')}",
+    ]
+    return "  ·  ".join(words)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from list3r.exporters.palette import Color, instance_color
-from list3r.exporters.plan.labels import TagTarget, place_tags
+from list3r.exporters.tags import TagTarget, place_tags
 from list3r.memory.masks import decode_mask
 from list3r.queries.pictures import InstanceSight, mask_border
 

@@ -1,7 +1,7 @@
 """How fast the picture of a video moves, and so from every how many of its frames depth is worth computing.
 
 Frames of a camera that moves slowly show the same from the same place: depth from two of them is poor, and a chunk of
-them sees things from too few sides (decision 0067).
+them sees things from too few sides (research/colour-video 0067).
 """
 
 from __future__ import annotations

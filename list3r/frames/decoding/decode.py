@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -106,8 +107,8 @@ def _decode(path: Stored, flags: int) -> NDArray[Any]:
         raise FrameError(f"{path.name} cannot be read ({error.strerror})") from None
     if not data:
         raise FrameError(f"{path.name} is empty")
-    if _cut_off(data):
-        raise FrameError(f"{path.name} is cut off")
+    if fault := _fault(data):
+        raise FrameError(f"{path.name} is {fault}")
     image = decode_picture(data, flags, path.name)
     if image is None:
         raise FrameError(f"{path.name} cannot be decoded")
@@ -115,14 +116,13 @@ def _decode(path: Stored, flags: int) -> NDArray[Any]:
 
 
 def fault_of(path: Stored | CodedArray) -> str | None:
-    """Return what is wrong with a file without decoding it: missing, empty or cut off; None where nothing is."""
+    """Return what is wrong with a file without decoding it: missing, empty, damaged or cut off; None for nothing."""
     try:
         data = _bytes(path.data if isinstance(path, CodedArray) else path)
     except OSError as error:
         return f"{path.name} cannot be read ({error.strerror})"
-    if not data or _cut_off(data):
-        return f"{path.name} is {'cut off' if data else 'empty'}"
-    return None
+    fault = _fault(data) if data else "empty"
+    return f"{path.name} is {fault}" if fault else None
 
 
 def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR, name: str = "the picture") -> NDArray[Any] | None:
@@ -137,14 +137,29 @@ def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR, name: str = "the 
     return None if image is None else np.asarray(image)
 
 
-def _cut_off(data: bytes) -> bool:
-    """Return whether a JPEG or PNG ends before its picture does.
+def _fault(data: bytes) -> str:
+    """Return whether a JPEG or PNG is cut off or a PNG damaged, by its own sums; empty where it is not.
 
-    Phones put a film or maps of brightness behind a JPEG.
+    Phones put a film or maps of brightness behind a JPEG. OpenCV says of a damaged PNG what it does line by line.
     """
     if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data
-    return data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", _scan_start(data)) < 0
+        return _png_fault(data)
+    return "cut off" if data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", _scan_start(data)) < 0 else ""
+
+
+def _png_fault(data: bytes) -> str:
+    """Return what is wrong with the parts of a PNG: length, name, content and CRC-32 each (PNG, section 5.3)."""
+    at = 8
+    while at + 12 <= len(data):
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if end > len(data):
+            break
+        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return "damaged"
+        if data[at + 4 : at + 8] == b"IEND":
+            return ""
+        at = end
+    return "cut off"
 
 
 def _scan_start(data: bytes) -> int:

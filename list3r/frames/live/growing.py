@@ -1,4 +1,4 @@
-"""A folder of any layout, or a recording of a robot, in which another program still writes frames."""
+"""A folder of any layout in which another program still writes frames."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from pathlib import Path
 
 from list3r.frames.live.feed import FeedState, LiveSettings
 from list3r.frames.options import SourceOptions
-from list3r.frames.readers.rosbag import recorded_bytes
 from list3r.frames.source import open_source
 from list3r.memory.errors import OptionError, SourceError
 
 
 class FolderFeed:
-    """A `Feed` of a folder or recording. The newest frame counts only when another one has come, for it may be half
+    """A `Feed` of a folder. The newest frame counts only when another one has come, for it may be half
     written.
     """
 
@@ -23,7 +22,7 @@ class FolderFeed:
         self._state = FeedState(0, (), False)
         self._found, self._idle_s = 0, 0.0
         self._arrived: list[float] = []
-        self._looked, self._held = 0.0, -1
+        self._looked = 0.0
 
     def state(self) -> FeedState:
         """What has come so far; the folder is looked at."""
@@ -34,7 +33,7 @@ class FolderFeed:
         self._idle_s += min(now - self._looked, 2 * self._settings.poll_s) if self._looked else 0.0
         self._looked = now
         try:
-            found = self._count()
+            found = open_source(self.folder, self._options).info.frame_count
         except (SourceError, OptionError, OSError):  # not there yet, or half written; what stays so is idle
             found = self._found
         if found > self._found:
@@ -45,15 +44,6 @@ class FolderFeed:
         reason = f"nothing new came for {self._settings.idle_s:g} s" if ended else ""
         self._state = replace(self._state, count=count, ended=ended, received=self._found, reason=reason)
         return self._state
-
-    def _count(self) -> int:
-        """How many frames are there; a recording is gone through only where it has grown."""
-        held = recorded_bytes(self.folder)
-        if held is not None and held == self._held:
-            return self._found
-        found = open_source(self.folder, self._options).info.frame_count
-        self._held = -1 if held is None else held
-        return found
 
     def admit(self) -> bool:
         """Frames of a folder do not wait to be let in."""

@@ -20,7 +20,7 @@ from list3r.frames.live.camera import LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.usbmux import connect, receive
 from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.errors import OptionError, SourceError, install_hint
 
 PORT = 1337
 _VARIES = 0.01
@@ -64,7 +64,7 @@ class Record3dPhone:
             import lzfse  # noqa: F401
         except ImportError:
             raise OptionError(
-                "depth of Record3D is packed with LZFSE, which needs a package: pip install 'list3r[record3d]'"
+                f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
             ) from None
         self._serial, self._tell = serial, tell
         self._first: _PhoneFrame | None = None

@@ -1,8 +1,8 @@
 """A live camera: its pictures are kept in a folder as they come, until the chunks have used them.
 
 While a chunk is worked on the newest pictures wait, and those before them are dropped and counted: whole stretches
-rather than every other frame, because the camera can be followed through a stretch (decision 0091). A lost connection
-is tried again.
+rather than every other frame, because the camera can be followed through a stretch (research/depth-odometry 0091). A
+lost connection is tried again.
 """
 
 from __future__ import annotations

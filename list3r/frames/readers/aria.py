@@ -28,7 +28,7 @@ from list3r.frames.recordings.aria_trajectory import DeviceTrajectory, read_traj
 from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.registration.rig import WORKING_SIDES
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line, install_hint
 
 COLOR, DEPTH = "214-1", "345-1"
 """Streams of the colour camera and, in a file of its own, of the Digital Twin's depth on its pixels."""
@@ -166,7 +166,7 @@ def _opened(path: Path, stream: str) -> Any:
             from projectaria_tools.core.stream_id import StreamId
     except ImportError:
         raise OptionError(
-            f"{path} is a recording of Aria, which needs a package: pip install 'list3r[aria]' (or, without its "
+            f"{path} is a recording of Aria, which needs a package: {install_hint('aria')} (or, without its "
             "drawing tools: pip install --no-deps projectaria-tools)"
         ) from None
     try:

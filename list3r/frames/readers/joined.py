@@ -56,6 +56,12 @@ class JoinedVideos(Reader):
         k = min(max(0, bisect_right(self._numbers, index) - 1), len(self._parts) - 1)
         return int(self._positions[k]) + self._parts[k].position(index - self._numbers[k])
 
+    def look(self, spots: int) -> Iterator[tuple[int, str]]:
+        """As `VideoSource.look`, with the spots shared among the files."""
+        for part, before in zip(self._parts, self._numbers, strict=False):
+            for number, reason in part.look(-(-spots // len(self._parts))):
+                yield number + before, reason
+
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
         """Small grey pictures of all frames handed out, None for one that is damaged."""
         for part in self._parts:

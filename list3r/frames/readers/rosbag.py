@@ -24,12 +24,11 @@ from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.bag_chunks import bound_rosbags
-from list3r.frames.recordings.bag_recovery import RecoveredFile, recovered
 from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color, read_depth
 from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError, first_line
+from list3r.memory.errors import FrameError, OptionError, SourceError, first_line, install_hint
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -59,13 +58,6 @@ def is_recording(path: Path) -> bool:
     if path.is_dir():
         return bool(_files(path))
     return path.suffix.lower() in ENDINGS or path.name.endswith(".bag.active")
-
-
-def recorded_bytes(path: Path) -> int | None:
-    """How long a recording is as yet; None for what is none."""
-    if not is_recording(path):
-        return None
-    return sum(p.stat().st_size for p in (_files(path) if path.is_dir() else [path]))
 
 
 def _files(path: Path) -> list[Path]:
@@ -121,7 +113,7 @@ class BagSource(Reader):
         stored = read_color(color.first).shape[:2]
         self._rig = build_rig(merged, stored, size, options.max_depth_m, options.max_side)
         posed = sum(T is not None for T in self._poses)
-        notes = [*notes, *merged_notes, *_cut_off(path), *unread]
+        notes = [*notes, *merged_notes, *unread]
         if len(pairs) < len(color.times_s):
             left = len(color.times_s) - len(pairs)
             notes.append(f"{left} of {len(color.times_s)} pictures have no depth within 20 ms and are left out")
@@ -229,7 +221,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise OptionError(f"{path} is a ROS recording, which needs a package: pip install 'list3r[ros]'") from None
+        raise OptionError(f"{path} is a ROS recording, which needs a package: {install_hint('ros')}") from None
     known = get_typestore(Stores.ROS2_HUMBLE)
     try:
         for part in [path] if path.is_file() or not path.is_dir() else sorted(path.iterdir()):
@@ -239,30 +231,20 @@ def _opened(path: Path) -> Iterator[AnyReader]:
             yield reader
     except (AnyReaderError, AssertionError, ValueError, KeyError, OSError, EOFError) as error:
         raise SourceError(
-            f"{path} cannot be read as a ROS recording ({first_line(error)}); reindex it, or copy it again"
+            f"{path} cannot be read as a ROS recording ({first_line(error)}); copy it again, or, where its "
+            "recorder was interrupted, mend it: `rosbag reindex` for a bag, `mcap recover` for an mcap"
         ) from None
 
 
-def _parts(path: Path) -> list[Any]:
-    """What `rosbags` opens of a recording: files that lack their end, with one."""
-    decompressors = bound_rosbags()
-    files = _files(path) if path.is_dir() else [path]
-    parts = [recovered(p, decompressors) or p for p in files]
-    return [path] if parts == files and _describes(path / "metadata.yaml") else parts
+def _parts(path: Path) -> list[Path]:
+    """What `rosbags` opens of a recording: its files where a folder has no metadata."""
+    bound_rosbags()
+    return [path] if path.is_file() or _describes(path / "metadata.yaml") else _files(path)
 
 
 def _describes(metadata: Path) -> bool:
     """Whether metadata are there, and not those of files that were packed when they were written."""
     return metadata.exists() and not re.search(rf"\.(db3|mcap){_PACKED}\b", metadata.read_text("utf-8", "replace"))
-
-
-def _cut_off(path: Path) -> list[str]:
-    """Say what is read of the files that lack their end."""
-    return [
-        f"{p.path.name} has no index, because its recorder was interrupted; {100 * p.end // p.size} % of it is read"
-        for p in _parts(path)
-        if isinstance(p, RecoveredFile)
-    ]
 
 
 class _Topics:

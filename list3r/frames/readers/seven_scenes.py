@@ -1,7 +1,7 @@
 """The 7-Scenes layout: `frame-NNNNNN.color.*`, `.depth.png`, `.pose.txt`.
 
 The Kinect of 7-Scenes delivers colour and depth unregistered, and its poses belong to the depth camera. The 585 px of
-its `camera-intrinsics.txt` are nominal; the cameras that are taken were measured (decision 0072).
+its `camera-intrinsics.txt` are nominal; the cameras that are taken were measured (research/depth-odometry 0072).
 """
 
 from __future__ import annotations

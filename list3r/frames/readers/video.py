@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ from list3r.frames.selection import select, sharpness
 from list3r.memory.errors import FrameError, OptionError, SourceError
 
 _MEASURED_PX, _THUMBNAIL_PX, _LOOKED_AT_PX = 320, 160, 640
+_LOOKED = 360
+"""Pictures that are decoded to see whether a video is damaged."""
+_DAMAGED = "the video is damaged here"
 _EARLIER = 4
 """Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
@@ -50,7 +53,7 @@ class VideoSource(Reader):
         """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
         for number, image in islice(self.pictures(start, stop), 0, None, step):
             if image is None:
-                yield BadFrame(number, "the video is damaged here")
+                yield BadFrame(number, _DAMAGED)
                 continue
             try:
                 color = self._rig.straight(self._upright.color(image, self._rig.color_size))
@@ -80,6 +83,17 @@ class VideoSource(Reader):
     def position(self, index: int) -> int:
         """Where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)
+
+    def look(self, spots: int) -> Iterator[tuple[int, str]]:
+        """Number of some frames and why each cannot be used, empty where it can: runs behind key frames all over."""
+        stamps, count = self._stamps, len(self._chosen)
+        keys = np.searchsorted(stamps.stamps, stamps.keys) if not stamps.counted else np.zeros(0, int)
+        starts = np.unique([0, *(self._chosen.position(int(k)) for k in keys)])
+        starts = starts[np.unique(np.linspace(0, len(starts) - 1, spots).round().astype(int))]
+        each = max(1, _LOOKED * count // (len(starts) * len(stamps)))
+        for start, stop in pairwise([*starts.tolist(), count]):
+            for number, image in self.pictures(start, min(stop, start + each)):
+                yield number, _DAMAGED if image is None else ""
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
         """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""

@@ -119,10 +119,11 @@ class VideoWithDepth(Reader):
     def _count_doubts(self) -> tuple[str, ...]:
         """Return how many frames of the video lack a pose or a depth image that others have."""
         total, parts = self._video.stored_count, self._parts
-        posed, deep = (sum(k < total for k in found) for found in (parts.poses, parts.depth))
+        posed = sum(k < total for k in parts.poses)
+        deep = sorted(k for k in parts.depth if k < total)
         return (
             *((without_pose(total - posed, total),) if 0 < posed < total else ()),
-            *((without_depth(total - deep, total),) if 0 < deep < total else ()),
+            *((without_depth(deep, total),) if 0 < len(deep) < total else ()),
         )
 
     def _some_files(self) -> list[Stored | CodedArray | None]:

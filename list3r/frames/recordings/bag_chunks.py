@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bz2
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from typing import Any, BinaryIO, Protocol, Self, cast
 
@@ -40,10 +40,8 @@ def bounded(unpacker: Callable[[], _Unpacker]) -> Callable[..., bytes]:
 
 
 @cache
-def bound_rosbags() -> Mapping[str, Callable[..., bytes]]:
-    """Have `rosbags` unpack within bounds, in this process; the bytes stay the same. Return what unpacks the chunks of
-    a ROS 1 bag.
-    """
+def bound_rosbags() -> None:
+    """Have `rosbags` unpack within bounds, in this process; the bytes stay the same."""
     from rosbags.rosbag1 import reader as first
     from rosbags.rosbag2 import reader as second
     from rosbags.rosbag2 import storage_mcap
@@ -61,7 +59,6 @@ def bound_rosbags() -> Mapping[str, Callable[..., bytes]]:
     storage_mcap.read_exact = _read_exact  # type: ignore[assignment]
     for table in (first.decompressors, storage_mcap.DECOMPRESSORS):
         table.update({name: unpack for name, unpack in known.items() if name in table})
-    return dict(first.decompressors)
 
 
 def _read_exact(file: BinaryIO, size: int) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 
 from list3r.frames.files import MAX_TEXT_BYTES, check_ordinary
 from list3r.frames.layout import inside, read_json
-from list3r.memory.errors import OptionError, SourceError, first_line
+from list3r.memory.errors import OptionError, SourceError, first_line, install_hint
 
 INFO = "meta/info.json"
 _VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -83,9 +83,7 @@ def _rows(root: Path, columns: list[str]) -> dict[int, dict[str, float]]:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise OptionError(
-            f"{root} is a LeRobot data set, which needs a package: pip install 'list3r[parquet]'"
-        ) from None
+        raise OptionError(f"{root} is a LeRobot data set, which needs a package: {install_hint('parquet')}") from None
     found: dict[int, dict[str, float]] = {}
     for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         try:

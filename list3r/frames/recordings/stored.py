@@ -15,7 +15,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import FrameError, OptionError
+from list3r.memory.errors import FrameError, OptionError, install_hint
 from list3r.memory.unpacking import open_archive
 
 MOST_BYTES = 256 * 2**20
@@ -149,7 +149,7 @@ def _lz4(data: bytes, count: int) -> bytes | None:
         from lz4.block import LZ4BlockError, decompress
     except ImportError:
         raise OptionError(
-            "depth of ScanNet++ is packed with LZ4, which needs a package: pip install 'list3r[scannetpp]'"
+            f"depth of ScanNet++ is packed with LZ4, which needs a package: {install_hint('scannetpp')}"
         ) from None
     try:
         return bytes(decompress(data, uncompressed_size=count))
@@ -176,7 +176,7 @@ def _lzfse(data: bytes, count: int) -> bytes | None:
         import lzfse
     except ImportError:
         raise OptionError(
-            "depth of Record3D is packed with LZFSE, which needs a package: pip install 'list3r[record3d]'"
+            f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
         ) from None
     fill = _filling(str(lzfse.__file__))
     if fill is not None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from list3r.frames.base import Camera, Frame
 from list3r.frames.recordings.axes import arkit_of_pose
 from list3r.frames.writers.pictures import jpeg
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import OptionError, install_hint
 
 SURE = 2
 """Confidence of depth that is known (stored 0, 1, 2)."""
@@ -27,7 +27,7 @@ class Record3dWriter:
             import lzfse
         except ImportError:
             raise OptionError(
-                "depth of Record3D is packed with LZFSE, which needs a package: pip install 'list3r[record3d]'"
+                f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
             ) from None
         self._pack = lzfse.compress
         self._camera, self._fps = camera, fps

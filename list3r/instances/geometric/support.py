@@ -55,7 +55,7 @@ def without_rims(image: NDArray[np.int32], depth: NDArray[np.float32], count: in
     """Return a label image without the pixels at outlines that stand before something farther.
 
     Depth computed from pictures compares windows of them. Windows at such an outline hold both surfaces, so that what
-    lies behind is drawn forward and hangs on the instance like a skirt (docs/decisions/0140-metres-and-skirts.md).
+    lies behind is drawn forward and hangs on the instance like a skirt (research/colour-video 0140).
     """
     label, around = image.astype(np.float32), np.ones((3, 3), np.uint8)
     inner = (cv2.erode(label, around) == label) & (cv2.dilate(label, around) == label)
@@ -68,7 +68,7 @@ FLIER_VOXEL_M = 0.02
 """Grain at which points are counted to find those that fly."""
 FLIER_SHARE = 0.15
 """Points of a voxel, over those of the voxel of a usual point of the thing, below which it holds readings that fly.
-Both chosen on seeds 5000 to 5009 and walks 1 to 6 of the house (docs/decisions/0081-boxes-without-fliers.md)."""
+Both chosen on seeds 5000 to 5009 and walks 1 to 6 of the house (research/discovery 0081)."""
 
 
 def without_fliers(points: NDArray[np.float32], unit: float) -> NDArray[np.int64]:

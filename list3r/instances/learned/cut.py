@@ -19,7 +19,7 @@ from list3r.instances.learned.things import ThingVerdicts, classify_things
 
 @dataclass(frozen=True)
 class CutSettings:
-    """Where agglomeration stops, chosen on left-out worlds (docs/decisions/0135-what-no-catalogue-knows.md)."""
+    """Where agglomeration stops, chosen on left-out worlds (research/discovery 0135)."""
 
     sure: float = 3.5
     """Mean log odds above which fine pieces become parts."""

@@ -2,7 +2,7 @@
 
 Computed depth is off by more than it is rough, alike over a patch, so that a patch of a wall stands before it like a
 thing. Two things that the networks do not see tell them apart: how far depth may be off there, and whether the picture
-shows a border round the patch (docs/decisions/0088-scraps-and-colour-alone.md).
+shows a border round the patch (research/discovery 0088).
 """
 
 from __future__ import annotations

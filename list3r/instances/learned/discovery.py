@@ -45,7 +45,7 @@ class LearnedSettings:
     where recall and precision meet near it."""
     least_confidence_computed: float = 0.4
     """... where depth was computed from pictures; anything from 0.3 to 0.5 does as well on left-out rooms
-    (docs/decisions/0201-what-computed-depth-lists.md)."""
+    (research/discovery 0201)."""
     least_scrap: float = 0.1
     """Things that are less probably one whole are not even kept."""
     plane_area_m2: float = 0.25

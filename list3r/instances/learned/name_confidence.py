@@ -28,7 +28,7 @@ class NameSigns:
 @dataclass(frozen=True)
 class NameConfidence:
     """Log odds that the likeliest name of a thing is right: logistic regression on rooms that the networks did not
-    learn from, none of them furnished by others (docs/decisions/0144-names-in-rooms-of-others.md).
+    learn from, none of them furnished by others (research/names 0144).
     """
 
     odds: float = 0.830

@@ -11,7 +11,8 @@ from list3r.weights import Float, WeightsFormat
 FORMAT = WeightsFormat("discovery", version=3)
 SHIPPED = Path(__file__).with_name("weights.npz")
 COMPUTED = Path(__file__).with_name("weights-computed.npz")
-"""Shipped for depth that was computed: those that learned from few colours, too, are worse there (decision 0179)."""
+"""Shipped for depth that was computed: those that learned from few colours, too, are worse there (research/discovery
+0179)."""
 
 
 @lru_cache(maxsize=4)

@@ -17,13 +17,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from list3r.memory.change.free_space_carving import FreeSpaceCarving
-from list3r.memory.change.ledger import ChangeLedger
 from list3r.memory.change.matching import ChangeMatching
 from list3r.memory.change.places import Places
 from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
 from list3r.memory.change.surface_colors import other_surfaces
 from list3r.memory.geometry import Sim3
-from list3r.memory.merging.edges import Key, PairScores
+from list3r.memory.merging.edges import PairScores
 from list3r.memory.overlap.summaries import ChunkSummary
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import ChangeEvent, ChunkRow
@@ -73,25 +72,21 @@ def find_changes(
     chunks: Sequence[ChunkRow],
     summaries: Mapping[int, ChunkSummary],
     settings: ChangeSettings,
-    told: ChangeLedger,
 ) -> Changes:
-    """Go through the sessions after those that are `told` of, in order, and find what each has changed."""
+    """Go through the sessions after the first, in order, and find what each has changed."""
     groups = [list(g) for g in found.groups]
     places = Places(store, groups, chunks, summaries, settings)
     matching = ChangeMatching(places, found, store.edits.constraints(), settings)
-    matching.go_on(told)
-    for session in sorted({c.session_id for c in chunks if c.session_id > told.session}):
+    for session in sorted({c.session_id for c in chunks})[1:]:
         matching.match(session)
     return matching.result()
 
 
-def as_events(changes: Changes, ids: Mapping[Key, int | None]) -> list[ChangeEvent]:
-    """Return the events of instances that have an id, by the first member of their groups."""
-    out = []
-    for c in changes.events:
-        instance = ids.get(c.first)
-        if instance is not None:
-            out.append(
-                ChangeEvent(c.session_id, instance, c.kind, c.from_box, c.to_box, c.frames, c.confidence, c.reason)
-            )
-    return out
+def as_events(changes: Sequence[tuple[int | None, Change]]) -> list[ChangeEvent]:
+    """Return the events of instances that have an id, each given with that, by session and id."""
+    found = (
+        ChangeEvent(c.session_id, n, c.kind, c.from_box, c.to_box, c.frames, c.confidence, c.reason)
+        for n, c in changes
+        if n is not None
+    )
+    return sorted(found, key=lambda e: (e.session_id, e.instance_id))

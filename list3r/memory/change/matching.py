@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.change.ledger import ChangeLedger
 from list3r.memory.change.moves import Missing, Move, MoveSearch, PlacedInstance
 from list3r.memory.change.places import Places
 from list3r.memory.change.records import Change, Changes, ChangeSettings, OverlapGroups
@@ -43,20 +42,6 @@ class ChangeMatching:
         """Places whose instances a session found at other places that they had before."""
         self._elsewhere: list[PlacedInstance] = []
         """Instances that a session did not find, though nothing tells it that they have just gone."""
-
-    def go_on(self, told: ChangeLedger) -> None:
-        """Begin with what sessions before have told of the groups."""
-        home = {key: n for n, group in enumerate(self._p.groups) for key in group}
-        for m in told.moved:
-            places = sorted({home[k] for place in m.places for k in place if k in home})
-            now = [home[k] for k in m.places[m.now] if k in home]
-            if now:
-                placed = PlacedInstance(places, now[0])
-                self._placed |= dict.fromkeys(places, placed)
-        for key in told.gone & home.keys():
-            self._placed[home[key]].state = "removed"
-        self._told_gone.update(self._placed[home[key]].places[0] for key in told.told_gone & home.keys())
-        self._instead.update(home[key] for key in told.displaced & home.keys())
 
     def match(self, session: int) -> None:
         """What one session has changed."""
@@ -308,7 +293,7 @@ class ChangeMatching:
 
     def result(self) -> Changes:
         """Return the groups as the matching leaves them."""
-        groups, current, states, told_gone = [], {}, {}, set()
+        groups, current, states = [], {}, {}
         names: dict[int, Key] = {}
         for placed in self._instances():
             keys = sorted(k for n in placed.places for k in self._p.groups[n])
@@ -318,11 +303,8 @@ class ChangeMatching:
                 current[keys[0]] = tuple(self._p.groups[placed.now])
             if placed.state != "present":
                 states[keys[0]] = placed.state
-            if placed.places[0] in self._told_gone:
-                told_gone.add(keys[0])
         events = tuple(replace(c, first=names[n]) for n, c in self._events if n in names)
-        displaced = frozenset(key for n in self._instead for key in self._p.groups[n])
-        return Changes(sorted(groups), current, states, events, self._decisions, frozenset(told_gone), displaced)
+        return Changes(sorted(groups), current, states, events, self._decisions)
 
 
 def _frames_see(found: PlaceVisibility, of: str = "") -> str:

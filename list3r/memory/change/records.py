@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.merging.edges import Key
@@ -131,21 +131,3 @@ class Changes:
     """By first member: the state of a group, where it is not `present`."""
     events: tuple[Change, ...]
     decisions: list[MergeDecision]
-    told_gone: frozenset[Key]
-    """First members of the groups that any session told to be gone."""
-    displaced: frozenset[Key]
-    """All members of what was found where something else had been, and of that."""
-
-    def without(self, keys: Collection[Key]) -> Changes:
-        """Return the same told of the other members of groups alone; a group of which none is left is gone."""
-        left = {g[0]: [k for k in g if k not in keys] for g in self.groups}
-        first = {key: g[0] for key, g in left.items() if g}
-        return Changes(
-            sorted(g for g in left.values() if g),
-            {first[k]: tuple(m for m in now if m not in keys) for k, now in self.current.items() if k in first},
-            {first[k]: state for k, state in self.states.items() if k in first},
-            tuple(replace(e, first=first[e.first]) for e in self.events if e.first in first),
-            self.decisions,
-            frozenset(first[key] for key in self.told_gone if key in first),
-            self.displaced - set(keys),
-        )

@@ -191,38 +191,38 @@ def contested(
     S_world_chunk: Mapping[int, Sim3],
     unit: float,
     settings: EvidenceSettings,
-    near: Ints | None = None,
-) -> dict[int, tuple[Ints, NDArray[np.bool_]]]:
-    """Return the points of each chunk that it alone gives to an instance, while several chunks give their place to
-    another one.
+) -> dict[int, NDArray[np.bool_]]:
+    """Return which points of each chunk it alone gives to an instance, while several chunks give their place to another
+    one. Shape (R,) each.
 
     Only instances that at least three chunks found lose points so: a chair's back that one chunk took for table.
-    Returns by chunk which points were asked about and whether they are dropped, (M,) each; with `near` (keys of cells,
-    see `claim_cells`) only those that lie there are, and every local instance with points there must be in a group.
     """
     names = sorted(chunks)
     number = {k: n for n, k in enumerate(names)}
     group = [np.full(len(chunks[k].local_id), -1, np.int64) for k in names]
-    large = np.array([*(len({k for k, _ in g}) >= 3 for g in groups), False], dtype=bool)
+    large = np.array([len({k for k, _ in g}) >= 3 for g in groups], dtype=bool)
     for n, members in enumerate(groups):
         for chunk_id, local_id in members:
             if chunk_id in number:
                 group[number[chunk_id]][int(np.searchsorted(chunks[chunk_id].local_id, local_id))] = n
-    cells = [claim_cells(chunks[k], S_world_chunk[k], unit, settings) for k in names]
-    asked = [np.arange(len(c)) if near is None else np.flatnonzero(_among(c, near)) for c in cells]
-    owner = np.concatenate([g[chunks[k].owner[a]] for g, k, a in zip(group, names, asked, strict=True)])
-    chunk = np.concatenate([np.full(len(a), n) for n, a in enumerate(asked)])
-    drop = np.zeros(len(owner), dtype=bool)
-    if len(owner):
-        _, place = np.unique(np.concatenate([c[a] for c, a in zip(cells, asked, strict=True)]), return_inverse=True)
-        claim, at = np.unique(place * (len(groups) + 1) + owner, return_inverse=True)
-        pairs = np.unique(at * len(names) + chunk)
-        count = np.bincount(pairs // len(names), minlength=len(claim))
-        most = np.zeros(int(place.max()) + 1, np.int64)
-        np.maximum.at(most, claim // (len(groups) + 1), count)
-        drop = large[owner] & (count[at] == 1) & (most[place] >= settings.claims)
-    split = np.cumsum([len(a) for a in asked])[:-1]
-    return {k: (a, d) for k, a, d in zip(names, asked, np.split(drop, split), strict=True)}
+    owners = [g[chunks[k].owner] for g, k in zip(group, names, strict=True)]
+    drop = {k: np.zeros(len(o), bool) for k, o in zip(names, owners, strict=True)}
+    kept = [np.flatnonzero(o >= 0) for o in owners]
+    if not any(map(len, kept)):
+        return drop
+    owner = np.concatenate([o[at] for o, at in zip(owners, kept, strict=True)])
+    chunk = np.repeat(np.arange(len(names)), [len(at) for at in kept])
+    cells = [claim_cells(chunks[k], S_world_chunk[k], unit, settings)[at] for k, at in zip(names, kept, strict=True)]
+    _, place = np.unique(np.concatenate(cells), return_inverse=True)
+    claim, at = np.unique(place * len(groups) + owner, return_inverse=True)
+    pairs = np.unique(at * len(names) + chunk)
+    count = np.bincount(pairs // len(names), minlength=len(claim))
+    most = np.zeros(int(place.max()) + 1, np.int64)
+    np.maximum.at(most, claim // len(groups), count)
+    lost = large[owner] & (count[at] == 1) & (most[place] >= settings.claims)
+    for n in np.unique(chunk[lost]).tolist():
+        drop[names[n]][kept[n]] = lost[chunk == n]
+    return drop
 
 
 def claim_cells(chunk: ChunkShapes, S_world_chunk: Sim3, unit: float, settings: EvidenceSettings) -> Ints:
@@ -230,11 +230,3 @@ def claim_cells(chunk: ChunkShapes, S_world_chunk: Sim3, unit: float, settings: 
     cell = np.floor(S_world_chunk.apply(chunk.points) / (settings.claim_m * unit)).astype(np.int64) + (1 << 20)
     c = np.clip(cell, 0, (1 << 21) - 1)
     return np.asarray(c[:, 0] << 42 | c[:, 1] << 21 | c[:, 2])
-
-
-def _among(keys: Ints, wanted: Ints) -> NDArray[np.bool_]:
-    """Return whether each key is one of the wanted ones, which ascend."""
-    if len(wanted) == 0:
-        return np.zeros(len(keys), dtype=bool)
-    at = np.minimum(np.searchsorted(wanted, keys), len(wanted) - 1)
-    return np.asarray(wanted[at] == keys)

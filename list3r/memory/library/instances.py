@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,12 +16,6 @@ from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.voxels import ChunkShapes
 from list3r.memory.records import BestView
 from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box, without_strays
-from list3r.memory.store.derived import KEPT_TURNS, LruCache
-from list3r.memory.store.store import Store
-
-_KEPT_BYTES = 6 << 20
-"""Points and frames of instances that are kept; more are derived again when they are asked for, so that memory does not
-grow with chunks."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +85,6 @@ class DerivedInstance:
     frames: NDArray[np.int64]
     """Session id and Frame.index of every frame in which it is seen, in order. Shape (F, 2)."""
     best_view: BestView | None
-    anchor: int
-    """Id of the chunk that saw it longest."""
     shape: str
     """Its shape in a word, see `memory.describe`."""
     swatches: tuple[Swatch, ...]
@@ -113,9 +103,7 @@ class Members:
     shown_by: Sequence[Key]
     """Those that show it where it is now."""
     chunks: Mapping[int, tuple[ChunkShapes, Sim3, NDArray[np.bool_]]]
-    """Shapes, settled pose in the world and dropped points of each chunk."""
-    marks: Mapping[int, bytes]
-    """What tells apart what each chunk measured, and where it lies."""
+    """Shapes, pose in the world and dropped points of each chunk."""
     component: int
     upright: bool
     """Whether z is up there."""
@@ -128,56 +116,22 @@ class Members:
         return [Member(c[0], int(np.searchsorted(c[0].local_id, n)), c[1], c[2]) for c, n in found]
 
 
-class InstanceCache(LruCache[tuple[object, ...], DerivedInstance]):
-    """Instances as they were derived from their members, by a digest of those: their names grow with the chunks."""
-
-    def __init__(self) -> None:
-        super().__init__(_KEPT_BYTES, _bytes_of, KEPT_TURNS)
-        self.stamps = itertools.count(1)
-
-
-def _bytes_of(found: DerivedInstance) -> int:
-    """Return what an instance takes, about."""
-    geometry = found.geometry
-    return 4096 + geometry.points.nbytes + geometry.rgb.nbytes + found.frames.nbytes
-
-
-def derived_instance(store: Store, instance_id: int, members: Members, settings: DeriveSettings) -> DerivedInstance:
-    """Return an instance, derived from its members unless it was just so before."""
-    m, cache = members, store.derived.of(InstanceCache)
-    shown_by = m.of(m.shown_by)
-    key = (instance_id, m.component, m.upright, _digest(m, shown_by), m.mover, settings)
-    kept = cache.get(key)
-    if kept is not None:
-        return kept
-    found = derive_instance(instance_id, shown_by, m.component, upright=m.upright, settings=settings)
-    if m.mover is not None:
-        last = m.of([k for k in m.group if k in m.mover.last])
-        now = derive_instance(instance_id, last, m.component, upright=m.upright, settings=settings)
-        found = replace(
-            found,
-            geometry=now.geometry,
-            box=now.box,
-            anchor=now.anchor,
-            shape=now.shape,
-            dynamic=True,
-            resting=m.mover.resting,
-        )
-    return cache.put(key, replace(found, geometry=replace(found.geometry, stamp=next(cache.stamps))))
-
-
-def _digest(members: Members, shown_by: Sequence[Member]) -> bytes:
-    """Return what tells apart all that an instance is derived from: who its members are, where their chunks lie, and
-    which of their points belong to something else.
-    """
-    digest = hashlib.blake2b(digest_size=16)
-    for keys in (members.group, members.shown_by):
-        digest.update(np.array([(len(keys), -1), *keys], np.int64).tobytes())
-    for k in sorted({k for k, _ in members.group}):
-        digest.update(members.marks[k])
-    for member in shown_by:
-        digest.update(np.packbits(member.dropped[slice(*member.span)]).tobytes())
-    return digest.digest()
+def derived_instance(instance_id: int, members: Members, settings: DeriveSettings) -> DerivedInstance:
+    """Return an instance of its members, where it is now."""
+    m = members
+    found = derive_instance(instance_id, m.of(m.shown_by), m.component, upright=m.upright, settings=settings)
+    if m.mover is None:
+        return found
+    last = m.of([k for k in m.group if k in m.mover.last])
+    now = derive_instance(instance_id, last, m.component, upright=m.upright, settings=settings)
+    return replace(
+        found,
+        geometry=now.geometry,
+        box=now.box,
+        shape=now.shape,
+        dynamic=True,
+        resting=m.mover.resting,
+    )
 
 
 def derive_instance(
@@ -217,19 +171,17 @@ def derive_instance(
         flagged=float(np.average([m.shapes.structure[m.at] for m in members], weights=np.maximum(counts, 1))),
         component=component,
     )
-    anchor = members[int(np.argmax(counts))].shapes.chunk_id
     unit_feature = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(geometry, told, unit_feature, frames, view, anchor, shape, colors)
+    return DerivedInstance(geometry, told, unit_feature, frames, view, shape, colors)
 
 
 def _frames(members: Sequence[Member]) -> NDArray[np.int64]:
     """Return session id and index of the frames that show any of the members, in order. Shape (F, 2)."""
-    seen = [(m.shapes.session_id, np.asarray(m.shapes.frames[m.at], np.int64)) for m in members]
-    pairs = np.concatenate([np.column_stack([np.full(len(f), session), f]) for session, f in seen])
-    return np.unique(pairs, axis=0)
+    seen = np.unique(np.concatenate([m.shapes.session_id << 40 | m.shapes.frames[m.at] for m in members]))
+    return np.column_stack([seen >> 40, seen & (1 << 40) - 1])
 
 
 def _metre(members: Sequence[Member]) -> float:

@@ -15,7 +15,6 @@ from typing import Any
 from list3r.memory.constraints import Key
 from list3r.memory.records import DetectedLabel, Instance, Votes
 from list3r.memory.settings import stored_settings
-from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 
 _SCORES = (0.02, 0.98)
@@ -50,13 +49,10 @@ def put_votes(
     source: str,
     votes: Mapping[int, Votes],
     class_names: Iterable[str] | None = None,
-    *,
-    fresh: bool = False,
 ) -> None:
     """Keep what a source saw of a chunk, instead of what the same one saw before. Call inside `transaction()`.
 
-    `class_names` are the classes that it knows, where that is a closed list: it says nothing against others. `fresh`
-    are votes of a chunk that has just come in.
+    `class_names` are the classes that it knows, where that is a closed list: it says nothing against others.
     """
     store.votes.put(
         chunk_id,
@@ -69,7 +65,6 @@ def put_votes(
             )
             for n, v in votes.items()
         },
-        fresh=fresh,
     )
     known = dict(store.facts.label_classes or {})
     names = None if class_names is None else sorted(class_names)
@@ -179,7 +174,10 @@ def apply_labels(
     settings = settings or stored_settings(store, LabelSettings, "library", "labels")
     before = store.detected_labels.all()
     instances = store.instances.all() if written is None else store.instances.of(sorted(written))
-    members = {i.id: _members(store, i.id) for i in instances}
+    members: dict[int, list[Key]] = {i.id: [] for i in instances}
+    for o in store.observations.all():
+        if o.instance_id in members:
+            members[o.instance_id].append((o.chunk_id, o.local_id))
     home = {key: n for n, keys in members.items() for key in keys}
     votes = {chunk_id: store.votes.of(chunk_id) for chunk_id in sorted({k for k, _ in home})}
     spoken = _named_by_operators(store, home)
@@ -188,7 +186,7 @@ def apply_labels(
     for i in instances:
         if i.id in spoken:
             continue
-        label = None if i.structure is not None else _label(store, members[i.id], votes, known, settings)
+        label = None if i.structure is not None else _label(members[i.id], votes, known, settings)
         if label is not None:
             out[i.id] = label
         text = None if label is None else label.label
@@ -202,46 +200,6 @@ def apply_labels(
     return out
 
 
-def _members(store: Store, instance_id: int) -> list[Key]:
-    """Return the local instances that an instance is derived of, or was before later sessions saw it again; others are
-    like one of these.
-    """
-    group = store.library.members.group_of(instance_id)
-    group += [row.key for row in store.library.redundant.superseded(group)]
-    return group or [(o.chunk_id, o.local_id) for o in store.observations.of(instance_id)]
-
-
-@dataclass(frozen=True)
-class _Told:
-    """What was told of redundant local instances that are like one, up to some chunk."""
-
-    through: int
-    votes: Mapping[str, Votes]
-    stamp: tuple[int, int]
-
-
-class _ToldCache(LruCache[Key, _Told]):
-    """By the local instance that they are like: a stay has more of them with every chunk."""
-
-    def __init__(self) -> None:
-        super().__init__(10_000)
-
-
-def _told_of_like(store: Store, key: Key) -> Mapping[str, Votes]:
-    """Return the votes for redundant local instances that are like one, added up in the order of their chunks."""
-    cache, redundant = store.derived.of(_ToldCache), store.library.redundant
-    redundant.chunks()
-    stamp = (redundant.turned, store.votes.turned)
-    before = cache.get(key)
-    if before is None or before.stamp != stamp:
-        before = _Told(0, {}, stamp)
-    votes, through = dict(before.votes), before.through
-    for row in redundant.like([key], before.through):
-        _add(votes, store.votes.of(row.key[0]), row.key[1])
-        through = row.key[0]
-    return cache.put(key, _Told(through, votes, stamp)).votes
-
-
 def _add(total: dict[str, Votes], votes: Mapping[str, Mapping[int, Votes]], local_id: int) -> None:
     for source, found in votes.items():
         if local_id in found:
@@ -249,7 +207,6 @@ def _add(total: dict[str, Votes], votes: Mapping[str, Mapping[int, Votes]], loca
 
 
 def _label(
-    store: Store,
     keys: Iterable[Key],
     votes: Mapping[int, Mapping[str, Mapping[int, Votes]]],
     known: Mapping[str, Collection[str] | None],
@@ -258,8 +215,6 @@ def _label(
     total: dict[str, Votes] = {}
     for chunk_id, local_id in sorted(keys):
         _add(total, votes.get(chunk_id, {}), local_id)
-        for source, found in _told_of_like(store, (chunk_id, local_id)).items():
-            total[source] = total.get(source, Votes(0.0, {})) + found
     chosen = decide_by_rank(total, known, settings)
     if chosen is None:
         return None

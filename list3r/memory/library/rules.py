@@ -1,20 +1,17 @@
-"""Settings of consolidation, what it reports, and what holds for the whole of a memory while it grows."""
+"""Settings of consolidation, what it reports, and what holds for the whole of a memory."""
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from list3r.memory.change.detection import ChangeSettings
-from list3r.memory.constraints import Key
 from list3r.memory.description.colors import Reference
-from list3r.memory.geometry import Sim3
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.instances import DeriveSettings
 from list3r.memory.library.labels import LabelSettings
-from list3r.memory.library.settled_poses import HysteresisSettings
+from list3r.memory.library.scores import RoundingSettings
 from list3r.memory.merging.movers import MovingSettings
 from list3r.memory.merging.settings import MergeSettings
 from list3r.memory.overlap.metre import metre_by_height
@@ -39,8 +36,6 @@ class RedundancySettings:
 
     chunks: int = 12
     """Earlier chunks of its session that must have seen its surface, as one thing or in pieces; 0: none is so."""
-    sessions: int = 3
-    """Later sessions that must have seen it again, and its surface together; 0: none is so."""
     covered: float = 0.75
     """Share of its surface that they must have seen."""
 
@@ -55,16 +50,12 @@ class ConsolidationSettings:
     structure: StructureSettings = field(default_factory=StructureSettings)
     relations: RelationSettings = field(default_factory=RelationSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-    hysteresis: HysteresisSettings = field(default_factory=HysteresisSettings)
+    rounding: RoundingSettings = field(default_factory=RoundingSettings)
     changes: ChangeSettings = field(default_factory=ChangeSettings)
     labels: LabelSettings = field(default_factory=LabelSettings)
     shapes: ShapeSettings = field(default_factory=ShapeSettings)
     gravity: GravitySettings = field(default_factory=GravitySettings)
     redundancy: RedundancySettings = field(default_factory=RedundancySettings)
-    whole_chunks: int = 6
-    """Up to so many chunks the library is derived as a whole; then only what a chunk touches."""
-    whole_share: float = 0.3
-    """Nor is it when more than this share of the chunks has moved."""
 
 
 def settings_of(store: Store, settings: ConsolidationSettings | None) -> ConsolidationSettings:
@@ -99,12 +90,12 @@ class ConsolidationReport:
     hidden: int
     """Groups of local instances that are not shown: seen too little, or fragments of an instance that is."""
     written: frozenset[int] | None = None
-    """Ids that were written anew or are gone; None where all were."""
+    """Ids to which something came; None where the library was derived."""
 
 
 @dataclass(frozen=True)
 class World:
-    """What every instance of a memory is derived with. When it changes, all of them are derived anew."""
+    """What every instance of a memory is derived with."""
 
     unit: float
     """What a metre is in world units."""
@@ -121,40 +112,10 @@ class World:
     """Posed frames, counted up to 80: fewer are asked of an instance in a short memory."""
     space: str
     """The embedding space of all chunks; empty where they have several."""
-    rules: int
-    """A checksum of the settings and of the kind of scale."""
-    T_world_graph: Sim3
-    """Where the graph's frame lies in the world."""
-    edits: int = 0
-    """The last edit of an operator that was obeyed."""
-
-    @property
-    def stamp(self) -> tuple[int, bytes]:
-        """What tells apart the rules and the frame of the world."""
-        return self.rules, self.T_world_graph.as_matrix().tobytes()
-
-    def near(self, other: World) -> bool:
-        """Return whether what was derived with the other one holds: the light and the unit may differ a little."""
-        if (self.upright, self.first, self.posed, self.space, self.floor_seen, self.rules) != (
-            other.upright,
-            other.first,
-            other.posed,
-            other.space,
-            other.floor_seen,
-            other.rules,
-        ) or not _same_frame(self.T_world_graph, other.T_world_graph):
-            return False
-        cast = float(np.hypot(*np.subtract(self.light.cast_ab, other.light.cast_ab)))
-        lit = abs(self.light.white_l - other.light.white_l) <= _WHITE_L and cast <= _CAST
-        return lit and abs(self.unit / other.unit - 1.0) <= _UNIT
 
 
 WORLD = Fact[World | None]("library", World, None)
-"""What the library was derived with; None where it has to be derived as a whole."""
-
-_UNIT = 0.02
-_WHITE_L, _CAST = 3.0, 2.0
-"""Changes that do not turn one colour name into another for more than borderline cases."""
+"""What the library was derived with; None before it was."""
 
 
 def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s: ConsolidationSettings) -> World:
@@ -165,7 +126,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
     unit = world_unit(chunks, summaries)
     floor = _floor(store, inside, summaries, unit) if upright else None
     unit = unit if is_known(chunks, summaries) else _by_cameras(store, inside, floor, unit)
-    spaces = {store.chunks.feature_space(c.chunk_id) for c in sample_of(chunks)}
+    spaces = {store.chunks.feature_space(c.chunk_id) for c in chunks}
     return World(
         unit=unit,
         light=light_of(chunks, summaries),
@@ -175,25 +136,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         chunks=len(chunks),
         posed=store.frames.posed_count(_POSED),
         space=spaces.pop() if len(spaces) == 1 else "",
-        rules=_rules(store, s),
-        T_world_graph=store.facts.S_world_graph,
-        edits=last_edit(store),
     )
-
-
-def known_world(store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) -> World | None:
-    """Return what the library was derived with, where that still holds as far as can be told without looking at all."""
-    world = store.facts[WORLD]
-    if world is None:
-        return None
-    same = _same_frame(world.T_world_graph, store.facts.S_world_graph)
-    return world if same and obeys(world, store, chunks, s) else None
-
-
-def obeys(world: World, store: Store, chunks: list[ChunkRow], s: ConsolidationSettings) -> bool:
-    """Return whether the library was derived by the rules that hold now, in whatever frame of the world."""
-    now = (_upright(store), min(c.component for c in chunks), store.frames.posed_count(_POSED), _rules(store, s))
-    return (world.upright, world.first, world.posed, world.rules) == now
 
 
 def _upright(store: Store) -> bool:
@@ -216,29 +159,3 @@ def _by_cameras(store: Store, inside: list[ChunkRow], floor: float | None, unit:
     heights = cameras_of(store, sample_of(inside)).translation[:, 2]
     height = float(np.median(heights)) - floor if floor is not None and len(heights) else 0.0
     return metre_by_height(height, unit)
-
-
-def _rules(store: Store, s: ConsolidationSettings) -> int:
-    return zlib.crc32(repr((s, store.facts.scale_kind)).encode())
-
-
-def _same_frame(a: Sim3, b: Sim3) -> bool:
-    """Return whether two frames of the world are one, but for what writing them down rounds."""
-    return bool(np.allclose(a.as_matrix(), b.as_matrix(), rtol=0.0, atol=1e-9))
-
-
-def last_edit(store: Store) -> int:
-    """Return the entry of the last edit, 0 where there is none."""
-    return max((e.entry for e in store.edits.all()), default=0)
-
-
-def edited_since(store: Store, since: int) -> frozenset[Key]:
-    """Return the local instances that edits after an entry name; an undo names those of what it takes back."""
-    edits = {e.entry: e for e in store.edits.all()}
-    left = [e for n, e in edits.items() if n > since]
-    out: set[Key] = set()
-    while left:
-        edit = left.pop()
-        out.update(k for part in (*edit.parts, *(keys for _, _, keys in edit.before)) for k in part)
-        left += [edits[n] for n in (edit.target,) if n in edits]
-    return frozenset(out)

@@ -15,6 +15,7 @@ from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
 from list3r.memory.records import Session
+from list3r.memory.store.beside import put_foreign_log_aside
 from list3r.memory.store.database import FAILURES, Database
 from list3r.memory.store.file import (
     check_beside,
@@ -32,8 +33,8 @@ from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
 """Tables that consolidation writes; a row lost there is written again."""
-_PASSING = ("settled", "overlaps", "members", "anchors", "redundant", "looks")
-"""Tables that consolidation goes on with; without them it derives the library as a whole."""
+_PASSING = ("pair_scores",)
+"""Tables of what can be computed again."""
 _OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""
@@ -90,6 +91,7 @@ def repair(path: str | Path, out: str | Path | None = None) -> RepairReport:
 
 
 def _repair(path: Path, target: Path) -> RepairReport:
+    put_foreign_log_aside(path)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}-repair-", dir=target.resolve().parent) as folder:
         copy, made = Path(folder) / "damaged.l3r", Path(folder) / "sound.l3r"
         _copy(path, copy)

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from list3r.memory.library.instances import Member, derive_instance
 from list3r.memory.library.rows import record_of
 from list3r.memory.library.rules import WORLD, ConsolidationSettings, World, settings_of
-from list3r.memory.library.settled_poses import extent_of, neighbours
+from list3r.memory.library.scene import Scene
 from list3r.memory.overlap.pair_scores import Key
 from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes, coverage
@@ -63,12 +63,12 @@ class _Placed:
 
     def __init__(self, store: Store, keys: Sequence[Key], settings: ConsolidationSettings) -> None:
         self._store, self._settings = store, settings
-        self._summaries, self._settled = chunk_summaries(store, settings.shapes), dict(store.library.settled.all())
-        for k in sorted(store.library.redundant.partly() & self._settled.keys()):
-            row = self._settled[k]
-            self._settled[k] = replace(row, extent=extent_of(self._summaries[k], row.S_graph_chunk))
+        world = store.facts[WORLD]
+        assert world is not None
+        self._summaries = chunk_summaries(store, settings.shapes)
+        self._scene = Scene(store, self._summaries, world, settings)
         self._grown = GrownCells()
-        self.shapes = {k: self._shapes_of(k) for k in sorted({k for k, _ in keys} & self._settled.keys())}
+        self.shapes = {k: self._shapes_of(k) for k in sorted({k for k, _ in keys})}
         """Scraps by chunk."""
 
     def _shapes_of(self, k: int) -> ChunkShapes:
@@ -79,7 +79,7 @@ class _Placed:
 
     def _same(self, a: ChunkShapes, b: ChunkShapes) -> NDArray[np.int64]:
         """Return positions (i, j) of what of two chunks lies on each other. Shape (M, 2)."""
-        u, v = (self._settled[x.chunk_id].S_graph_chunk for x in (a, b))
+        u, v = (self._scene.pose(x.chunk_id) for x in (a, b))
         a_on_b = coverage(a, b, v.inverse() @ u, self._grown)
         b_on_a = coverage(b, a, u.inverse() @ v, self._grown)
         return np.argwhere(np.minimum(a_on_b, b_on_a.T) >= _SHARED)
@@ -88,7 +88,7 @@ class _Placed:
         """Return pairs of scraps of different chunks that are one."""
         out: list[tuple[Key, Key]] = []
         for k, own in self.shapes.items():
-            for v in (v for v in neighbours(self._settled, k) if v > k and v in self.shapes):
+            for v in (v for v in self._scene.near[k] if v > k and v in self.shapes):
                 ids, others = own.local_id, self.shapes[v].local_id
                 out += [((k, int(ids[i])), (v, int(others[j]))) for i, j in self._same(own, self.shapes[v])]
         return out
@@ -98,7 +98,7 @@ class _Placed:
         listed = {(o.chunk_id, o.local_id) for o in self._store.observations.all()}
         out: set[Key] = set()
         for k, own in self.shapes.items():
-            for v in (v for v in neighbours(self._settled, k) if v != k):
+            for v in (v for v in self._scene.near[k] if v != k):
                 things = self._summaries[v].shapes
                 same = self._same(own, things)
                 out |= {(k, int(own.local_id[i])) for i, j in same if (v, int(things.local_id[j])) in listed}

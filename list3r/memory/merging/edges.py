@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from list3r.memory.constraints import ConstraintCheck, Constraints, key_name
 from list3r.memory.geometry import Array
 from list3r.memory.merging.nodes import Nodes
 from list3r.memory.merging.settings import MergeSettings
-from list3r.memory.overlap.pair_scores import Key, PairScores, box_iou, joined, pair_scores
+from list3r.memory.overlap.pair_scores import Key, PairScores, PairTable, box_iou, pair_scores
 from list3r.memory.overlap.voxels import Ints
 from list3r.memory.records import MergeDecision
 
@@ -44,7 +44,7 @@ class Links:
     """What argues for each of M pairs of local instances that meet being one instance."""
 
     a: Ints
-    """Position of the first one: in its chunk, or among the nodes. Shape (M,)."""
+    """Position of the first one among the nodes. Shape (M,)."""
     b: Ints
     """Of the second one, which comes later. Shape (M,)."""
     kind: NDArray[np.int8]
@@ -60,29 +60,6 @@ class Links:
     frame_iou: Array
     """Mean IoU of their boxes in the frames that two chunks share; NaN where they share too few. Shape (M,)."""
 
-    @staticmethod
-    def join(parts: Sequence[tuple[int, int, Links]]) -> Links:
-        """Return those of many pairs of chunks, each with the numbers of the first nodes of its two chunks."""
-        sizes = [len(p.a) for _, _, p in parts]
-        starts = [np.repeat(np.array([p[n] for p in parts], np.int64), sizes) for n in (0, 1)]
-        return Links(
-            starts[0] + joined([p.a for _, _, p in parts], np.int64),
-            starts[1] + joined([p.b for _, _, p in parts], np.int64),
-            joined([p.kind for _, _, p in parts], np.int8),
-            joined([p.score for _, _, p in parts], np.float64),
-            joined([p.a_on_b for _, _, p in parts], np.float64),
-            joined([p.b_on_a for _, _, p in parts], np.float64),
-            joined([p.cosine for _, _, p in parts], np.float64),
-            joined([p.frame_iou for _, _, p in parts], np.float64),
-        )
-
-    def among(self, number: Ints) -> Links:
-        """Return those of which both nodes have a new number, which is -1 for the others."""
-        a, b = number[self.a], number[self.b]
-        kept = np.flatnonzero((a >= 0) & (b >= 0))
-        rest = (getattr(self, name)[kept] for name in ("kind", "score", "a_on_b", "b_on_a", "cosine", "frame_iou"))
-        return Links(a[kept], b[kept], *rest)
-
     def scores_of(self, n: int) -> dict[str, float]:
         """Return the numbers of one pair, for the log."""
         low, high = sorted((self.a_on_b[n], self.b_on_a[n]))
@@ -93,16 +70,14 @@ class Links:
 
 
 def form_groups(
-    tables: Mapping[int, Nodes],
-    links: Mapping[tuple[int, int], Links],
-    region: Collection[Key] | None,
+    nodes: Nodes,
+    links: Links,
     cannot_link: Sequence[tuple[Key, Key]],
     settings: MergeSettings,
     constraints: Constraints | None = None,
 ) -> tuple[list[list[Key]], list[MergeDecision]]:
-    """Group local instances into instances; only those of a `region` where one is given.
+    """Group local instances, in one frame of reference, into instances.
 
-    `tables` are the local instances of each chunk, in one frame of reference; `links` are of pairs of chunks, u <= v.
     The partition is the same in whatever order chunks and pairs are given: links are taken best first, ties by key. Two
     groups are joined unless a cannot-link pair would come together, or too many pairs across contradict it (complete
     link), or far more chunks tell them apart than see them as one, or the operator's `constraints` part them. What
@@ -110,41 +85,30 @@ def form_groups(
     it. Returns the groups, each sorted, ordered by their first member, and the decisions: one `merge` for each union,
     one `refuse` for each strong link that was not taken.
     """
-    if not tables:
-        return [], []
-    nodes = Nodes.join([tables[k] for k in sorted(tables)])
-    start = nodes.start
-    every = Links.join([(start[u], start[v], x) for (u, v), x in links.items()])
-    if region is not None:
-        inside = np.array([k in region for k in nodes.keys], bool)
-        every = every.among(np.where(inside, np.cumsum(inside) - 1, -1))
-        nodes = nodes.only(region)
     check = constraints.check() if constraints else None
-    return _join(nodes, every, _enemies(nodes, cannot_link), settings, check)
+    return _join(nodes, links, _enemies(nodes, cannot_link), settings, check)
 
 
 # ---------------------------------------------------------------------------------------------- the evidence
 
 
-def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
-    """Return what argues for the local instances of two chunks that meet being one instance; `u` and `v` may be one
-    chunk.
-    """
-    a, b, inside = p.i, p.j, u.keys[:1] == v.keys[:1]
-    low, high = np.minimum(p.i_on_j, p.j_on_i), np.maximum(p.i_on_j, p.j_on_i)
-    cosine = np.einsum("ij,ij->i", u.feature[a], v.feature[b]).astype(float)
-    across = np.full(len(a), not inside)
+def links_of(t: Nodes, p: PairTable, s: MergeSettings) -> Links:
+    """Return what argues for local instances that meet being one instance."""
+    a, b = p.a, p.b
+    low, high = np.minimum(p.a_on_b, p.b_on_a), np.maximum(p.a_on_b, p.b_on_a)
+    cosine = np.einsum("ij,ij->i", t.feature[a], t.feature[b]).astype(float)
+    across = t.chunk[a] != t.chunk[b]
     enough = (p.shared >= s.min_shared_frames) & across
-    larger, smaller = np.maximum(u.size[a], v.size[b]), np.minimum(u.size[a], v.size[b])
+    larger, smaller = np.maximum(t.size[a], t.size[b]), np.minimum(t.size[a], t.size[b])
     alike = larger < s.max_size_ratio * smaller
     one_mask, apart = enough & (p.frame_iou >= s.same_mask_iou), enough & (p.frame_iou < _APART_IOU)
-    coplanar = u.coplanar(a, b, s.max_angle_deg, v)
-    both_structure, one_structure = u.structure[a] & v.structure[b], u.structure[a] ^ v.structure[b]
+    coplanar = t.coplanar(a, b, s.max_angle_deg)
+    both_structure, one_structure = t.structure[a] & t.structure[b], t.structure[a] ^ t.structure[b]
     same = (low >= s.min_overlap) & (high >= s.min_containment) & (~one_structure | (low >= 0.5) & coplanar)
     same |= one_mask & alike & (high >= s.same_mask_containment) & ~one_structure
     same &= across | (low >= s.min_containment)
-    cut = np.where(p.i_on_j >= p.j_on_i, u.truncated[a], v.truncated[b])
-    color = np.linalg.norm((u.lab[a] - v.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
+    cut = np.where(p.a_on_b >= p.b_on_a, t.truncated[a], t.truncated[b])
+    color = np.linalg.norm((t.lab[a] - t.lab[b]) * np.array([0.5, 1.0, 1.0]), axis=1)
     part = (high >= s.part_containment) & (color <= s.max_part_color) & ~one_structure & across
     part &= (cut >= s.min_truncated) | (coplanar & (smaller / np.maximum(larger, 1e-12) >= s.min_part_size))
     piece = both_structure & coplanar & (high >= s.piece_containment)
@@ -156,7 +120,7 @@ def links_of(u: Nodes, v: Nodes, p: PairScores, s: MergeSettings) -> Links:
     wanted = (same | part | piece) & (cosine >= s.min_cosine) & ~(apart & ~both_structure)
     kind = np.where(wanted, np.where(same, SAME, np.where(part, PART, PLANE)), NONE).astype(np.int8)
     frame_iou = np.where(enough, p.frame_iou, np.nan)
-    return Links(a, b, kind, np.round(score, 6).astype(np.float64), p.i_on_j, p.j_on_i, cosine, frame_iou)
+    return Links(a, b, kind, np.round(score, 6).astype(np.float64), p.a_on_b, p.b_on_a, cosine, frame_iou)
 
 
 # ---------------------------------------------------------------------------------------------- the decision

@@ -7,9 +7,9 @@ begins.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,11 +97,7 @@ def without_moving(
     if not motions:
         return dict(pairs)
     moves = {k: np.array([(k, int(n)) in motions for n in s.local_id], bool) for k, s in shapes.items()}
-    out = {}
-    for (u, v), p in pairs.items():
-        keep = ~(moves[u][p.i] | moves[v][p.j])
-        out[u, v] = PairScores(*(x[keep] for x in (p.i, p.j, p.i_on_j, p.j_on_i, p.shared, p.frame_iou)))
-    return out
+    return {(u, v): p.only(~(moves[u][p.i] | moves[v][p.j])) for (u, v), p in pairs.items()}
 
 
 def join_movers(
@@ -160,31 +156,15 @@ class _Edge:
 def _edges(nodes: Sequence[_Node], scene: _Scene) -> list[_Edge]:
     """Return what ties the nodes that move to others of their session and component, best first, ties by number."""
     out = []
-    for (a, x), (b, y) in combinations(enumerate(nodes), 2):
-        if (x.moves or y.moves) and x.session == y.session and scene.component(x) == scene.component(y):
+    moving = [n for n, node in enumerate(nodes) if node.moves]
+    pairs = {(min(n, m), max(n, m)) for n in moving for m in range(len(nodes)) if n != m}
+    for a, b in sorted(pairs):
+        x, y = nodes[a], nodes[b]
+        if x.session == y.session and scene.component(x) == scene.component(y):
             found = scene.edge(x, y)
             if found is not None:
                 out.append(_Edge(a, b, *found))
     return sorted(out, key=lambda e: (-e.score, e.a, e.b))
-
-
-def tied_movers(
-    here: Collection[Key],
-    there: Collection[Key],
-    placed: PlacedChunks,
-    tracks: Tracks,
-    settings: MovingSettings | None = None,
-) -> set[Key]:
-    """Return the local instances of `there` that `join_movers` would compare with one of `here`, of one session and
-    component all.
-    """
-    scene = _Scene(placed, tracks, settings or MovingSettings())
-
-    def tied(a: Key, b: Key) -> bool:
-        moves = a in tracks.motions or b in tracks.motions
-        return a[0] != b[0] and moves and scene.edge(scene.node((a,)), scene.node((b,))) is not None
-
-    return {b for b in there if any(tied(a, b) for a in here)}
 
 
 class _Scene:

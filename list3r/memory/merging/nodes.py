@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,36 +72,11 @@ class Nodes:
             np.concatenate(high) if high else np.zeros((0, 3)),
         )
 
-    @staticmethod
-    def join(parts: Sequence[Nodes]) -> Nodes:
-        """Return those of several chunks, in the order of the chunks."""
-        start: dict[int, int] = {}
-        count = 0
-        for p in parts:
-            start |= {chunk: count + at for chunk, at in p.start.items()}
-            count += len(p.keys)
-        features = [p.feature for p in parts if len(p.keys)]
-        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
-        feature = np.concatenate(features) if features else np.zeros((0, 1), np.float32)
-        return Nodes(keys=[k for p in parts for k in p.keys], start=start, feature=feature, **joined)
-
-    def only(self, keys: Collection[Key]) -> Nodes:
-        """Return some of them."""
-        at = np.array([n for n, k in enumerate(self.keys) if k in keys], np.int64)
-        chosen: dict[str, Any] = {name: getattr(self, name)[at] for name in (*_COLUMNS, "feature")}
-        return Nodes(keys=[self.keys[n] for n in at], start={}, **chosen)
-
-    def coplanar(self, a: Ints, b: Ints, angle_deg: float, other: Nodes | None = None) -> NDArray[np.bool_]:
-        """Return whether pairs of flat nodes lie in one plane; false where one is not flat. `b` are of the `other`
-        table.
-        """
-        other = other or self
-        one, two = self.plane[a], other.plane[b]
+    def coplanar(self, a: Ints, b: Ints, angle_deg: float) -> NDArray[np.bool_]:
+        """Return whether pairs of flat nodes lie in one plane; false where one is not flat."""
+        one, two = self.plane[a], self.plane[b]
         cosine = np.einsum("ij,ij->i", one[:, :3], two[:, :3])
-        off_b = np.abs(np.einsum("ij,ij->i", one[:, :3], other.center[b]) + one[:, 3])
+        off_b = np.abs(np.einsum("ij,ij->i", one[:, :3], self.center[b]) + one[:, 3])
         off_a = np.abs(np.einsum("ij,ij->i", two[:, :3], self.center[a]) + two[:, 3])
-        near = np.maximum(off_a, off_b) <= 2.0 * np.maximum(self.tolerance[a], other.tolerance[b])
+        near = np.maximum(off_a, off_b) <= 2.0 * np.maximum(self.tolerance[a], self.tolerance[b])
         return np.asarray((cosine > np.cos(np.radians(angle_deg))) & near)
-
-
-_COLUMNS = ("center", "size", "plane", "truncated", "structure", "tolerance", "unit", "lab", "low", "high")

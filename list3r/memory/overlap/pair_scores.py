@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,13 +33,12 @@ class PairScores:
     frame_iou: Array
     """Mean IoU of their boxes in those frames. Shape (E,)."""
 
-    def renumbered(self, first: Ints | None, second: Ints | None) -> PairScores:
-        """Return those of which both have a new position in their chunk, which is -1 for the others. None: as it is."""
-        i = self.i if first is None else first[self.i]
-        j = self.j if second is None else second[self.j]
-        kept = (i >= 0) & (j >= 0)
-        rest = (getattr(self, name)[kept] for name in ("i_on_j", "j_on_i", "shared", "frame_iou"))
-        return PairScores(i[kept], j[kept], *rest)
+    def only(self, kept: NDArray[np.bool_]) -> PairScores:
+        """Return some of them, (E,)."""
+        return PairScores(*(getattr(self, name)[kept] for name in _COLUMNS))
+
+
+_COLUMNS = ("i", "j", "i_on_j", "j_on_i", "shared", "frame_iou")
 
 
 def pair_scores(u: ChunkShapes, v: ChunkShapes, S_u_v: Sim3, grown: GrownCells | None = None) -> PairScores:
@@ -65,25 +64,31 @@ def _shared_frames(u: ChunkShapes, v: ChunkShapes) -> tuple[Ints, Array]:
     if u.session_id != v.session_id or not shape[0] or not shape[1]:
         return count, total
     frames_u, frames_v = np.concatenate(u.frames), np.concatenate(v.frames)
-    common = np.intersect1d(frames_u, frames_v)
     boxes_u, boxes_v = np.concatenate(u.boxes_xyxy).astype(float), np.concatenate(v.boxes_xyxy).astype(float)
     owner_u = np.repeat(np.arange(shape[0]), [len(f) for f in u.frames])
+    order = np.argsort(frames_v, kind="stable")
+    first = np.searchsorted(frames_v[order], frames_u)
+    times = np.searchsorted(frames_v[order], frames_u, side="right") - first
+    at_u = np.repeat(np.arange(len(frames_u)), times)
+    at_v = order[np.arange(len(at_u)) + np.repeat(first - (np.cumsum(times) - times), times)]
     owner_v = np.repeat(np.arange(shape[1]), [len(f) for f in v.frames])
-    for frame in common:
-        at_u, at_v = np.flatnonzero(frames_u == frame), np.flatnonzero(frames_v == frame)
-        cell = np.ix_(owner_u[at_u], owner_v[at_v])
-        count[cell] += 1
-        total[cell] += box_iou(boxes_u[at_u], boxes_v[at_v])
+    cell = owner_u[at_u] * shape[1] + owner_v[at_v]
+    count = np.bincount(cell, minlength=count.size).reshape(shape)
+    total += np.bincount(cell, _iou(boxes_u[at_u], boxes_v[at_v]), minlength=total.size).reshape(shape)
     return count * min(u.stands_for, v.stands_for), total / np.maximum(count, 1)
 
 
 def box_iou(a: Array, b: Array) -> Array:
     """Return IoU of boxes xyxy. Shape (A, 4), (B, 4) -> (A, B)."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    inter = np.prod(np.clip(high - low, 0, None), axis=2)
-    area_a, area_b = np.prod(a[:, 2:] - a[:, :2], axis=1), np.prod(b[:, 2:] - b[:, :2], axis=1)
-    return np.asarray(inter / np.maximum(area_a[:, None] + area_b[None] - inter, 1e-9))
+    return _iou(a[:, None], b[None])
+
+
+def _iou(a: Array, b: Array) -> Array:
+    """Return IoU of pairs of boxes xyxy. Shapes (..., 4) broadcast."""
+    low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
+    inter = np.prod(np.clip(high - low, 0, None), axis=-1)
+    area_a, area_b = (np.prod(x[..., 2:] - x[..., :2], axis=-1) for x in (a, b))
+    return np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9))
 
 
 class Numbering:
@@ -100,12 +105,6 @@ class Numbering:
 
     def __len__(self) -> int:
         return len(self.keys)
-
-    def flags(self, keys: Collection[Key]) -> NDArray[np.bool_]:
-        """Return which of them are among some local instances. Shape (N,)."""
-        out = np.zeros(len(self.keys), bool)
-        out[[self._at[k] for k in keys if k in self._at]] = True
-        return out
 
     def homes(self, groups: Iterable[Sequence[Key]]) -> Ints:
         """Return the number of the group that each is in, -1 for none. Shape (N,)."""
@@ -127,6 +126,10 @@ class PairTable:
     """Share of a's surface that lies on b. Shape (M,)."""
     b_on_a: Array
     """Shape (M,)."""
+    shared: Ints
+    """Frames of the recording in which both are seen. Shape (M,)."""
+    frame_iou: Array
+    """Mean IoU of their boxes in those frames. Shape (M,)."""
 
     @staticmethod
     def of(pairs: Mapping[tuple[int, int], PairScores], numbering: Numbering) -> PairTable:
@@ -140,6 +143,8 @@ class PairTable:
             start_v + joined([p.j for _, _, p in known], np.int64),
             joined([p.i_on_j for _, _, p in known], np.float64),
             joined([p.j_on_i for _, _, p in known], np.float64),
+            joined([p.shared for _, _, p in known], np.int64),
+            joined([p.frame_iou for _, _, p in known], np.float64),
         )
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +43,17 @@ class ChunkSummary:
     motions: dict[int, MotionTrack | None]
     """The local instances that move, by local id, and where they were; what bounds a room never does."""
 
+    @cached_property
+    def digest(self) -> bytes:
+        """What tells it apart from any other: overlaps are kept by it."""
+        digest, shapes = hashlib.blake2b(digest_size=16), self.shapes
+        measured = (shapes.local_id, shapes.points, shapes.rgb, shapes.owner, shapes.occupied, shapes.truncated)
+        parts: list[NDArray[Any]] = [*measured, *shapes.frames, *shapes.boxes_xyxy]
+        for part in parts:
+            digest.update(part.tobytes())
+        digest.update(repr(sorted(self.motions)).encode())
+        return digest.digest()
+
     @property
     def sampled(self) -> SampledChunk:
         """What is asked of it where it is one of those that tell what holds for the whole memory."""
@@ -57,7 +70,7 @@ class SampledChunk:
     """Colours of a sample of all its points. Shape (C, 3)."""
 
 
-_KEPT_BYTES = 48 << 20
+_KEPT_BYTES = 256 << 20
 """Summaries that are kept, by their size; more are derived again when they are asked for, so that memory does not grow
 with chunks. Of a chunk with 12 instances it takes 0.2 MB, of one with 50 a megabyte."""
 _SAMPLED = 64
@@ -74,71 +87,37 @@ def _bytes_of(summary: ChunkSummary) -> int:
     return sum(p.nbytes + 100 for p in parts if isinstance(p, np.ndarray))
 
 
-class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None, frozenset[int]], ChunkSummary]):
-    """Summaries by chunk id, checksum of what the chunk measured, settings, and local instances that are left out."""
+class SummaryCache(LruCache[tuple[int, int, ShapeSettings | None], ChunkSummary]):
+    """Summaries by chunk id, checksum of what the chunk measured, and settings."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, _bytes_of, KEPT_TURNS)
 
 
-_HELD_BYTES = 256 << 20
-"""While a library is derived more are held: where all chunks moved they are asked for in one pass after another."""
-
-
-class _HeldSummaries(LruCache[tuple[int, frozenset[int]], ChunkSummary]):
-    """By chunk id and local instances that are left out."""
-
-    def __init__(self) -> None:
-        super().__init__(_HELD_BYTES, _bytes_of)
-
-
 class SampledCache(LruCache[tuple[int, int], SampledChunk]):
-    """By chunk id and checksum of what the chunk measured: of up to 64 chunks planes are asked for with every new one,
-    when much of what those saw is left out of their summaries, and of the same ones colours when a session ends.
-    """
+    """By chunk id and checksum of what the chunk measured: up to 64 chunks are asked for theirs with every new one."""
 
     def __init__(self) -> None:
         super().__init__(_SAMPLED * 2)
-        self.newest = -1
-        """The last chunk of the sample that is kept."""
 
 
 class Summaries(Mapping[int, ChunkSummary]):
     """The summaries of chunks by id, derived when first asked for.
 
-    They depend on what the chunks measured, not on where they are placed. With `hold` more of them are held as long as
-    this object is.
+    They depend on what the chunks measured, not on where they are placed.
     """
 
-    def __init__(self, store: Store, settings: ShapeSettings | None = None, *, hold: bool = False) -> None:
+    def __init__(self, store: Store, settings: ShapeSettings | None = None) -> None:
         self._store = store
         self._settings = settings
         self._ids = [c.chunk_id for c in store.chunks.all()]
         self._known = store.derived.of(SummaryCache)
         self._checked: dict[int, int] = {}
-        self._held = _HeldSummaries() if hold else None
 
     def __getitem__(self, chunk_id: int) -> ChunkSummary:
-        return self._found(chunk_id, frozenset())
-
-    def without(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
-        """Return a summary without some of the local instances, by local id; if there are any, without planes."""
-        return self._found(chunk_id, left_out)
-
-    def _found(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
-        if self._held is None:
-            return self._known_or_derived(chunk_id, left_out)
-        held = self._held.get((chunk_id, left_out))
-        return held or self._held.put((chunk_id, left_out), self._known_or_derived(chunk_id, left_out))
-
-    def _known_or_derived(self, chunk_id: int, left_out: frozenset[int]) -> ChunkSummary:
-        key = chunk_id, self._checksum(chunk_id), self._settings, left_out
+        key = chunk_id, self._checksum(chunk_id), self._settings
         found = self._known.get(key)
-        if found is not None:
-            return found
-        if left_out:
-            return self._known.put(key, _without(self[chunk_id], left_out))
-        return self._known.put(key, _summary(self._store, self._store.chunks.get(chunk_id), self._settings))
+        return found or self._known.put(key, _summary(self._store, self._store.chunks.get(chunk_id), self._settings))
 
     def planes(self, chunk_id: int) -> Planes:
         """Return the planes of a chunk."""
@@ -148,14 +127,6 @@ class Summaries(Mapping[int, ChunkSummary]):
         """Return what a chunk tells of the whole memory."""
         known, key = self._store.derived.of(SampledCache), (chunk_id, self._checksum(chunk_id))
         return known.get(key) or known.put(key, self[chunk_id].sampled)
-
-    def keep_sample(self) -> None:
-        """Keep what the sampled chunks of a long memory tell while they are at hand: a session's end asks for it."""
-        known, sample = self._store.derived.of(SampledCache), sample_of(self._ids)
-        if len(self._ids) > _SAMPLED and sample[-1] != known.newest:
-            for chunk_id in sample:
-                self.sampled(chunk_id)
-            known.newest = sample[-1]
 
     def _checksum(self, chunk_id: int) -> int:
         if chunk_id not in self._checked:
@@ -194,9 +165,9 @@ class SomeSummaries(Mapping[int, ChunkSummary]):
         return len(self._ids)
 
 
-def chunk_summaries(store: Store, settings: ShapeSettings | None = None, *, hold: bool = False) -> Summaries:
+def chunk_summaries(store: Store, settings: ShapeSettings | None = None) -> Summaries:
     """Return the summaries of all chunks by id; without settings, by those that the memory was begun with."""
-    return Summaries(store, settings or stored_settings(store, ShapeSettings, "library", "shapes"), hold=hold)
+    return Summaries(store, settings or stored_settings(store, ShapeSettings, "library", "shapes"))
 
 
 def sample_of(chunks: Sequence[T]) -> list[T]:
@@ -227,14 +198,6 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     return ChunkSummary(shapes, planes, store.chunks.cannot_links(chunk.chunk_id), unit, motions)
 
 
-def _without(summary: ChunkSummary, left_out: frozenset[int]) -> ChunkSummary:
-    gone, links = list(left_out), summary.cannot_link
-    shapes = summary.shapes.only(~np.isin(summary.shapes.local_id, gone))
-    links = links[~np.isin(links, gone).any(axis=1)]
-    motions = {n: motion for n, motion in summary.motions.items() if n not in left_out}
-    return ChunkSummary(shapes, chunk_planes([]), links, summary.unit, motions)
-
-
 def _unit(store: Store, chunk: ChunkRow) -> float:
     """Return about what a metre is in chunk units, by what the cameras saw."""
     samples = store.chunks.samples(chunk.chunk_id)
@@ -255,7 +218,9 @@ def world_unit(chunks: Sequence[ChunkRow], summaries: Mapping[int, ChunkSummary]
     known = getattr(summaries, "metre", None)
     if is_known(chunks, summaries):
         return 1.0 if known is None else float(known)
-    units = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in sample_of(chunks)]
+    told = [(c, summaries[c.chunk_id]) for c in sample_of(chunks)]
+    seeing = [(c, s) for c, s in told if c.scale_kind == "metric" or len(s.shapes.samples)]
+    units = [float(c.S_world_chunk.scale) * s.unit for c, s in seeing or told]
     return float(np.median(units)) if units else 1.0
 
 

@@ -304,20 +304,8 @@ def _reached(target: ChunkShapes) -> tuple[Array, Array]:
     return low, high
 
 
-def lies_on(points: Array, target: ChunkShapes, grown: GrownCells | None = None) -> NDArray[np.bool_]:
-    """Return which points, in the frame of a chunk, lie within the tolerance of any of its instances. Shape (P,)."""
-    found = np.zeros(len(points), bool)
-    if len(target.occupied) == 0:
-        return found
-    cells, grains = (GrownCells() if grown is None else grown).of(target), _grains(points, target)
-    for level in np.unique(target.level).tolist():
-        left = np.flatnonzero(~found)
-        found[left[cells.find(_key_at(grains[:, left], level))[0]]] = True
-    return found
-
-
-_KEPT_BYTES = 32 << 20
-"""Those of some 70 chunks with a dozen things: of a place that many sessions saw, all are asked for with each chunk."""
+_KEPT_BYTES = 128 << 20
+"""Those of some 280 chunks with a dozen things: of a place that many sessions saw, all are asked for in turn."""
 
 
 @dataclass(frozen=True)

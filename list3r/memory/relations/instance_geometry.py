@@ -36,8 +36,6 @@ class InstanceGeometry:
     component: int = 0
     """Frame of reference."""
     confidence: float = 1.0
-    stamp: int = 0
-    """Two instances of one stamp have the same points; 0 where nothing is promised."""
 
     @property
     def size(self) -> float:

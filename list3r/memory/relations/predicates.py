@@ -51,7 +51,7 @@ def relations(
     """Return all relations among instances, in the order of (subject, predicate, object).
 
     `unit` is what a metre is in world units (1 for a metric memory). Instances of different components have none.
-    `measured` holds what a run before found for the same instances, unit and settings.
+    `measured` holds what was found for the same instances, unit and settings before.
     """
     s = settings or RelationSettings()
     instances = sorted(instances, key=lambda b: b.id)

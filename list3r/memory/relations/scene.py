@@ -22,28 +22,17 @@ T = TypeVar("T")
 
 
 class PairMeasures:
-    """What was measured between pairs of instances before, by their stamps: a run computes only what is new."""
+    """What was measured between pairs of instances, by their ids: each is looked at from both, in several places."""
 
     def __init__(self) -> None:
-        self._before: dict[tuple[object, ...], object] = {}
-        self._used: dict[tuple[object, ...], object] = {}
-        self._basis: object = None
-
-    def begin(self, unit: float, settings: RelationSettings) -> None:
-        """Begin a run: what the last one did not ask for is forgotten, and all of it where its unit or settings were
-        others.
-        """
-        self._before = self._used if self._basis == (unit, settings) else {}
-        self._used, self._basis = {}, (unit, settings)
+        self._known: dict[tuple[str, int, int], object] = {}
 
     def get(self, what: str, a: InstanceGeometry, b: InstanceGeometry, compute: Callable[[], T]) -> T:
         """Return the measure `what` of a and b, computed if it is new."""
-        if not (a.stamp and b.stamp):
-            return compute()
-        key = (what, a.stamp, b.stamp, a.structure, b.structure)
-        if key not in self._used:
-            self._used[key] = self._before[key] if key in self._before else compute()
-        return cast(T, self._used[key])
+        key = what, a.id, b.id
+        if key not in self._known:
+            self._known[key] = compute()
+        return cast(T, self._known[key])
 
 
 Found = tuple[int, int, float, float]

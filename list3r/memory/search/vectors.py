@@ -123,7 +123,7 @@ class VectorIndex:
             ids, vectors = store.embeddings.changed(self.space, self.upto)
             if len(ids) > max(1000, _REBUILD * self.count) or (len(ids) and vectors.shape[1] != self.dimension):
                 return False
-            self._fresh, self._changes = (ids, _unit(vectors)), changes
+            self._fresh, self._changes = (ids, unit(vectors)), changes
         return True
 
     def search(
@@ -133,7 +133,12 @@ class VectorIndex:
 
         `passing` says which of some ids may answer; it is asked about as few as it takes.
         """
-        query = self._checked(vector)
+        query = unit_query(vector)
+        if len(query) != self.dimension:
+            raise SpaceMismatchError(
+                f"a vector of {len(query)} numbers cannot be compared in the space {self.space}, "
+                f"which has {self.dimension}"
+            )
         width = max(4 * k, _RANKED)
         probed = max(_PROBED, -(-_LOOKED_AT * _cell_count(self.count) // max(self.count, 1)))
         while True:
@@ -148,7 +153,7 @@ class VectorIndex:
         changed, fresh = self._fresh
         ids = np.setdiff1d(self.index.search(query, min(width, self.count), probed), changed)
         ids, vectors = store.embeddings.of(self.space, ids.tolist())
-        found = list(zip(ids.tolist(), (_unit(vectors) @ query).tolist(), strict=True)) if len(ids) else []
+        found = list(zip(ids.tolist(), (unit(vectors) @ query).tolist(), strict=True)) if len(ids) else []
         if len(changed):
             found += zip(changed.tolist(), (fresh @ query).tolist(), strict=True)
         return sorted(found, key=lambda x: (-x[1], x[0]))
@@ -159,18 +164,6 @@ class VectorIndex:
         if len(ids) == 0:
             raise OptionError(f"instance {instance_id} has no vector in the space {self.space}")
         return np.asarray(vectors[0])
-
-    def _checked(self, vector: ArrayLike) -> Floats:
-        query = np.asarray(vector, dtype=np.float32).ravel()
-        if len(query) != self.dimension:
-            raise SpaceMismatchError(
-                f"a vector of {len(query)} numbers cannot be compared in the space {self.space}, "
-                f"which has {self.dimension}"
-            )
-        length = float(np.linalg.norm(query))
-        if not np.isfinite(length) or length == 0.0:
-            raise OptionError("the vector to compare with must be finite and not zero")
-        return np.asarray(query / length)
 
 
 def _first(
@@ -215,7 +208,7 @@ def _made(store: Store, space: str) -> VectorIndex:
     count, changes, rollbacks = store.embeddings.count(space), store.embeddings.changes(), store.connection.rollbacks
     if count <= _EXACT:
         ids, vectors = store.embeddings.all(space)
-        return VectorIndex(space, dimension, count, _AllVectors(ids, _unit(vectors)), changes, rollbacks, changes)
+        return VectorIndex(space, dimension, count, _AllVectors(ids, unit(vectors)), changes, rollbacks, changes)
     index = _filled(store, space, count)
     found = VectorIndex(space, dimension, count, _Cells(index), changes, rollbacks, changes)
     if store.embeddings.of_the_file():
@@ -227,14 +220,14 @@ def _filled(store: Store, space: str, count: int) -> Any:
     """Return FAISS's index of all vectors, its cells learned on a sample."""
     import faiss
 
-    sample = _unit(store.embeddings.sample(space, _PER_CELL * _cell_count(count)))
+    sample = unit(store.embeddings.sample(space, _PER_CELL * _cell_count(count)))
     cells = min(_cell_count(count), len(sample))
     index: Any = faiss.index_factory(sample.shape[1], f"IVF{cells},SQ8", faiss.METRIC_INNER_PRODUCT)
     index.by_residual = False
     index.cp.niter, index.cp.seed, index.cp.spherical, index.cp.min_points_per_centroid = _ROUNDS, 1, True, 1
     index.train(sample)
     for ids, vectors in store.embeddings.batches(space):
-        index.add_with_ids(_unit(vectors), ids)
+        index.add_with_ids(unit(vectors), ids)
     return index
 
 
@@ -294,7 +287,28 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("LIST3R_CACHE") or home / "list3r") / "vectors"
 
 
-def _unit(vectors: Floats) -> Floats:
-    """Return vectors of length 1, of zeros where a vector is. Shape (n, D)."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.ascontiguousarray(vectors / np.maximum(length, 1e-12), dtype=np.float32)
+def unit(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return vectors of length 1, of zeros where a vector is; of any finite numbers. Shape (n, D)."""
+    with np.errstate(over="ignore", under="ignore"):
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    out = np.ascontiguousarray(vectors / np.where(length > 0.0, length, 1.0), dtype=np.float32)
+    odd = ~((length > 1e-12) & (length < np.inf))[:, 0]  # squares of these cannot be added up as they are
+    if odd.any():
+        scale = np.abs(vectors[odd]).max(axis=1, keepdims=True)
+        scaled = vectors[odd].astype(np.float64) / np.where(scale > 0.0, scale, 1.0)
+        out[odd] = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1.0)
+    return out
+
+
+def unit_query(vector: ArrayLike) -> NDArray[np.float32]:
+    """Return a vector to compare with at length 1. Shape (D,).
+
+    Raises `OptionError` for what is not a row of finite numbers, or all zero.
+    """
+    try:
+        asked = np.asarray(vector, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        asked = np.zeros(0)
+    if asked.shape[-1:] != (asked.size,) or not np.isfinite(asked).all() or not asked.any():
+        raise OptionError("the vector to compare with must be a row of finite numbers, not all zero")
+    return np.ravel(unit(asked.reshape(1, -1)))

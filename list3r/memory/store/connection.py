@@ -16,6 +16,7 @@ from typing import Any, Self, cast
 import apsw
 
 from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.store.beside import not_alone, opened_to_read, take_up_log
 from list3r.memory.store.database import FAILURES, Database
 from list3r.memory.store.file import (
     check_beside,
@@ -24,14 +25,13 @@ from list3r.memory.store.file import (
     fold_in,
     identified,
     migrate,
-    not_alone,
     private_copy,
-    reader,
     taken,
     use_write_ahead_log,
     write_empty,
 )
 from list3r.memory.store.lock import WriterLock
+from list3r.memory.store.log_mark import LogMark
 from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.verify import damage_of
 
@@ -61,6 +61,7 @@ class Connection:
         self.path = path
         self._database = database
         self._lock = lock
+        self._mark = LogMark(database)
         self._process = os.getpid()
         self._version = 0
         self.writing = False
@@ -132,7 +133,7 @@ class Connection:
     def _open_to_read(cls, path: Path) -> Self:
         database: Database | None = None
         try:
-            database = reader(path.resolve())
+            database = opened_to_read(path.resolve())
             if identified(path, database) < SCHEMA_VERSION:
                 database.close()
                 database = private_copy(path)
@@ -149,6 +150,7 @@ class Connection:
     def _connect(cls, path: Path, lock: WriterLock) -> Self:
         database: Database | None = None
         try:
+            take_up_log(path.resolve())
             database = connected(path, "rw")
             version = identified(path, database)
             use_write_ahead_log(path, database)
@@ -194,7 +196,9 @@ class Connection:
                 self.writing = True
                 try:
                     yield
+                    self._mark.write()
                     self._database.commit()
+                    self._mark.forget()
                 except BaseException:
                     self._roll_back()
                     raise
@@ -209,6 +213,7 @@ class Connection:
     def _roll_back(self) -> None:
         self.rollbacks += 1
         self._database.roll_back()
+        self._mark.forget()
         self.forget()
 
     def on_forget(self, forget: Callable[[], None]) -> None:

@@ -13,7 +13,11 @@ from list3r.memory.store.pages import PageDamaged, WatchedFile, check_state, sch
 
 FAILURES = (apsw.Error, UnicodeError)
 """What SQLite raises on a damaged file; a damaged name in its message cannot even be decoded."""
-_FLAGS = {"ro": apsw.SQLITE_OPEN_READONLY, "rw": apsw.SQLITE_OPEN_READWRITE}
+_MODES = {
+    "ro": ("ro", apsw.SQLITE_OPEN_READONLY),
+    "rw": ("rw", apsw.SQLITE_OPEN_READWRITE),
+    "file": ("ro&immutable=1", apsw.SQLITE_OPEN_READONLY),
+}
 _LOG_PAGES = 1000
 """Pages in the write-ahead log from which they are folded into the file."""
 _SUMS = "SELECT first, sums FROM main.pages"
@@ -23,10 +27,11 @@ class Database(apsw.Connection):
     """One file, opened by `memory.store.file.connected`."""
 
     def __init__(self, path: Path, mode: str) -> None:
-        """`mode` is ro or rw; the file must be there."""
+        """`mode` is ro, rw or file (see `connected`); the file must be there."""
         self._watched = WatchedFile()
-        flags = _FLAGS[mode] | apsw.SQLITE_OPEN_URI
-        super().__init__(f"file:{quote(bytes(path.resolve()))}?mode={mode}", flags, self._watched.name)
+        how, flags = _MODES[mode]
+        uri = f"file:{quote(bytes(path.resolve()))}?mode={how}"
+        super().__init__(uri, flags | apsw.SQLITE_OPEN_URI, self._watched.name)
         self._version: int | None = None
         self._broken: PageDamaged | None = None
         self.wal_autocheckpoint(0)
@@ -71,6 +76,15 @@ class Database(apsw.Connection):
         watched.checking = True
         watched.forget()
 
+    @contextlib.contextmanager
+    def writing_into_the_file(self) -> Iterator[None]:
+        """Inside, transactions write into the file itself, which has no log then, and pages are summed there."""
+        self._watched.direct = True
+        try:
+            yield
+        finally:
+            self._watched.direct = False
+
     def fold_in_long_log(self) -> None:
         """Write the log into the file where it has become long; what readers hold stays for the next time."""
         log = Path(f"{self.db_filename('main')}-wal")
@@ -97,7 +111,7 @@ class Database(apsw.Connection):
         self.execute("PRAGMA integrity_check").fetchall()
         self._watched.written, self._watched.unjudged, self._watched.checking = self._watched.unjudged, None, False
         version = int(self.execute("PRAGMA user_version").fetchall()[0][0])  # type: ignore[arg-type]
-        self.execute(f"DELETE FROM pages; PRAGMA user_version = {schema_of(version)}")
+        self.execute(f"DELETE FROM log_mark; DELETE FROM pages; PRAGMA user_version = {schema_of(version)}")
         self.commit()
 
     def close(self, force: bool = False) -> None:

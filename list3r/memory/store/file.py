@@ -15,6 +15,7 @@ import apsw
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.database import Database
+from list3r.memory.store.log_mark import LOG_STARTS, begin_marking
 from list3r.memory.store.pages import PageDamaged, schema_of
 from list3r.memory.store.rows.codec import MAX_BLOB_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
@@ -48,7 +49,7 @@ _UNREADABLE_HERE = {
 """What SQLite says of a file that it could read only by writing."""
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 _BESIDE = {
-    "-wal": (bytes.fromhex("377f0682"), bytes.fromhex("377f0683")),
+    "-wal": LOG_STARTS,
     "-journal": (_JOURNAL, bytes(len(_JOURNAL))),
     "-shm": (),
 }
@@ -81,10 +82,12 @@ def explained(path: Path, error: Exception) -> str:
     return f"{path}: {text}; run `list3r verify {path}`, `list3r repair {path}` saves what is sound"
 
 
-def connected(path: Path, mode: str, *, alone: bool = False) -> Database:
+def connected(path: Path, mode: str, *, alone: bool = False, whole: bool = True) -> Database:
     """A connection that runs nothing that the file brings along and holds no value larger than a blob may be.
 
-    With `alone` it asks for the file for itself until it is told otherwise.
+    With `alone` it asks for the file for itself until it is told otherwise. The mode is one of SQLite, or `file`, in
+    which only the file is read, as it is: no log or journal, and without a lock. Unless it is to be `whole`, a file
+    that is shorter than it says is read as well.
     """
     try:
         str(path.resolve()).encode()
@@ -95,6 +98,8 @@ def connected(path: Path, mode: str, *, alone: bool = False) -> Database:
         database.set_busy_timeout(round(1000 * _WAIT_S))
         if alone:
             database.execute("PRAGMA locking_mode=EXCLUSIVE").fetchall()
+        if not whole:
+            database.execute("PRAGMA writable_schema=ON")
         protect(database)
     except BaseException:
         database.close()
@@ -218,6 +223,7 @@ def use_write_ahead_log(path: Path, database: Database) -> None:
     database.execute(f"PRAGMA busy_timeout={round(1000 * _DRAIN_S)}").fetchall()
     while True:
         try:
+            begin_marking(database)
             database.execute("PRAGMA journal_mode=WAL").fetchall()
             break
         except apsw.BusyError as error:
@@ -245,14 +251,15 @@ def _readers(path: Path) -> str:
     return f"process {', '.join(map(str, sorted(held)))} (is it stopped?)" if held else "another process"
 
 
-def private_copy(path: Path) -> Database:
+def private_copy(path: Path, *, log: bool = True) -> Database:
     """A connection to a copy of a file and of its journals, in the present schema, which nobody else sees and which
-    ends with it.
+    ends with it. Without `log` what is in the log beside the file is left out.
     """
     try:
         with tempfile.TemporaryDirectory(prefix="list3r-") as folder:
             copy = Path(folder) / "copy.l3r"
-            for end in (end for end in ("", "-wal", "-journal") if Path(f"{path}{end}").exists()):
+            ends = ("", "-wal", "-journal") if log else ("", "-journal")
+            for end in (end for end in ends if Path(f"{path}{end}").exists()):
                 shutil.copyfile(f"{path}{end}", f"{copy}{end}")
             return _without_journal(path, connected(copy, "rw"))
     except OSError as error:
@@ -288,19 +295,6 @@ def check_beside(path: Path) -> None:
                 ours = not head or head in starts  # a writer may have emptied it since
         if not ours:
             raise MemoryFileError(f"{beside} has a name that {path.name} needs while it is written; move it away")
-
-
-def not_alone(path: Path, database: Database) -> str | None:
-    """One sentence where a file lacks what was written last, which lies in the log beside it or did; None where not."""
-    log = Path(f"{path.resolve()}-wal")
-    size = log.stat().st_size if log.exists() else 0
-    if size:
-        return (
-            f"what was written last lies in {log.name} ({size / 1e6:.2f} MB): a copy needs both files; "
-            f"`list3r repair {path}` folds it in when nobody writes"
-        )
-    copied = database.execute("PRAGMA journal_mode").fetchall()[0][0] == "off"
-    return f"it was copied while {log.name} was beside it; what was written last may be missing" if copied else None
 
 
 def fold_in(database: Database, wait_ms: int) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import socket
 import stat
 import sys
 import weakref
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,14 @@ class WriterLock:
         """
         self._path = lock_path(path)
         descriptor, ours = self._take(path)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps(_me()).encode(), 0)
+        try:
+            _write_holder(descriptor)
+        except OSError as error:
+            _let_go(descriptor, self._path, os.getpid(), ours)
+            raise MemoryFileError(
+                f"{path} cannot be written: {self._path.name}: {error.strerror}; free some space and run the command "
+                "again"
+            ) from error
         self._end = weakref.finalize(self, _let_go, descriptor, self._path, os.getpid(), ours)
 
     def _take(self, memory: Path) -> tuple[int, bool]:
@@ -91,6 +98,14 @@ def lock_path(memory: Path) -> Path:
     return memory.with_name(f"{memory.name}-writer")
 
 
+def _write_holder(descriptor: int) -> None:
+    """Say in a lock who holds it. Raises `OSError` where that does not fit on the disk."""
+    text = json.dumps(_me()).encode()
+    os.ftruncate(descriptor, 0)
+    if os.pwrite(descriptor, text, 0) < len(text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def _let_go(descriptor: int, path: Path, process: int, ours: bool) -> None:
     if os.getpid() == process and _is_current(descriptor, path):
         with contextlib.suppress(OSError):
@@ -136,7 +151,7 @@ def _me() -> dict[str, object]:
         "pid": os.getpid(),
         "host": socket.gethostname(),
         "program": " ".join([program, *words]),
-        "since": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 

@@ -88,6 +88,8 @@ class WatchedFile(apsw.VFS):
         self.checking = True
         self.count: Callable[[], bytes] = bytes
         """How often the file was changed, as its first page says: big-endian."""
+        self.direct = False
+        """Whether transactions write into the file itself, not into a log."""
         self._noted: set[int] | None = None
         self.name = f"list3r-{next(_numbers)}"
         super().__init__(self.name, "unix")
@@ -173,6 +175,12 @@ class _Main(apsw.VFSFile):
         data = super().xRead(size, offset - skipped)
         self._watched.note_read(offset // size + 1, data)
         return data if amount == size else data[skipped : skipped + amount]
+
+    def xWrite(self, data: bytes, offset: int) -> None:
+        """Write a page: one of the log that is folded in, or of a transaction without a log."""
+        super().xWrite(data, offset)
+        if self._watched.direct:
+            self._watched.note_written(offset // self._watched.page_bytes + 1, bytes(data))
 
 
 class _Log(apsw.VFSFile):

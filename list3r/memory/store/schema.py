@@ -133,27 +133,10 @@ MIGRATIONS: tuple[str, ...] = (
         entry INTEGER PRIMARY KEY, created_at TEXT NOT NULL, author TEXT NOT NULL, kind TEXT NOT NULL,
         arguments TEXT NOT NULL) STRICT;
 
-    CREATE TABLE settled (
-        chunk_id INTEGER PRIMARY KEY REFERENCES chunks, component INTEGER NOT NULL, S_graph_chunk BLOB NOT NULL,
-        extent BLOB NOT NULL, dropped BLOB NOT NULL, carried BLOB NOT NULL) STRICT;
-    CREATE TABLE overlaps (
-        u INTEGER NOT NULL REFERENCES chunks, v INTEGER NOT NULL REFERENCES chunks, scores BLOB NOT NULL,
-        PRIMARY KEY (u, v)) STRICT, WITHOUT ROWID;
-    CREATE INDEX overlaps_by_second ON overlaps (v);
-    CREATE TABLE members (
-        chunk_id INTEGER NOT NULL, local_id INTEGER NOT NULL, first_chunk INTEGER NOT NULL,
-        first_local INTEGER NOT NULL, shown INTEGER NOT NULL, PRIMARY KEY (chunk_id, local_id)) STRICT, WITHOUT ROWID;
-    CREATE INDEX members_by_group ON members (first_chunk, first_local);
-    CREATE TABLE anchors (
-        instance INTEGER PRIMARY KEY REFERENCES instances, chunk_id INTEGER NOT NULL,
-        S_exact_settled BLOB NOT NULL) STRICT;
-    CREATE TABLE redundant (
-        chunk_id INTEGER NOT NULL REFERENCES chunks, local_id INTEGER NOT NULL, like_chunk INTEGER NOT NULL,
-        like_local INTEGER NOT NULL, frames BLOB NOT NULL, PRIMARY KEY (chunk_id, local_id)) STRICT, WITHOUT ROWID;
-    CREATE INDEX redundant_by_like ON redundant (like_chunk, like_local);
-    CREATE TABLE looks (
-        instance INTEGER PRIMARY KEY REFERENCES instances, shape TEXT NOT NULL, resting INTEGER NOT NULL,
-        swatches BLOB NOT NULL CHECK (length(swatches) > 0 AND length(swatches) % 56 = 0)) STRICT;
+    CREATE TABLE pair_scores (
+        u INTEGER NOT NULL REFERENCES chunks, v INTEGER NOT NULL REFERENCES chunks, stamp BLOB NOT NULL,
+        scores BLOB NOT NULL, PRIMARY KEY (u, v)) STRICT, WITHOUT ROWID;
+    CREATE TABLE log_mark (id INTEGER PRIMARY KEY, mark BLOB NOT NULL) STRICT;
 
     CREATE VIEW things AS
         SELECT id, coalesce(label, description) AS name, label, description, color_name AS color,

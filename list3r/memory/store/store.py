@@ -23,9 +23,9 @@ from list3r.memory.store.tables.frames import Frames, Keyframes
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.instances import Instances
 from list3r.memory.store.tables.labels import DetectedLabels, LabelVotes
-from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.local_instances import LocalInstances, Supports
 from list3r.memory.store.tables.observations import Observations
+from list3r.memory.store.tables.pair_scores import PairScoreTable
 from list3r.memory.store.tables.relations import RelationTable
 from list3r.memory.store.tables.sessions import Sessions
 from list3r.memory.store.tables.words import Words
@@ -51,11 +51,6 @@ class Store:
     # ------------------------------------------------------------------ what chunks measured, and where they lie
 
     @cached_property
-    def library(self) -> LibraryState:
-        """What consolidation goes on with."""
-        return LibraryState(self.connection)
-
-    @cached_property
     def sessions(self) -> Sessions:
         """The videos."""
         return Sessions(self.connection)
@@ -78,12 +73,12 @@ class Store:
     @cached_property
     def local_instances(self) -> LocalInstances:
         """What one chunk measured of one thing."""
-        return LocalInstances(self.connection, self.supports, self.library)
+        return LocalInstances(self.connection, self.supports)
 
     @cached_property
     def chunks(self) -> Chunks:
         """Chunks, and where each lies."""
-        return Chunks(self.connection, self.frames, self.keyframes, self.local_instances, self.library)
+        return Chunks(self.connection, self.frames, self.keyframes, self.local_instances)
 
     @cached_property
     def edges(self) -> Edges:
@@ -106,6 +101,11 @@ class Store:
         return PlacedTrajectory(self.chunks, self.frames, self.bends)
 
     # ------------------------------------------------------------------ what is derived, and what operators said of it
+
+    @cached_property
+    def pair_scores(self) -> PairScoreTable:
+        """How pairs of chunks overlap."""
+        return PairScoreTable(self.connection)
 
     @cached_property
     def merges(self) -> MergeLog:

@@ -25,14 +25,14 @@ from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.registry import make_discoverer, make_frame_look, make_tracker
-from list3r.instances.settings import FEATURE_SPACE
-from list3r.memory.errors import BaselineError, TrackingError
+from list3r.memory.errors import BaselineError, SourceError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.models.device import out_of_memory_reported
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
-from list3r.reconstruction.features.learned import LearnedDetector, make_detector
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.keyframe_record import FrameLook, KeyframeNetworks, frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, entry, import_model, make_reconstructor
 
@@ -69,12 +69,15 @@ def process_parts(task: ChunkTask, discoverer: Discoverer | None = None) -> tupl
     frames = [f for f in read if isinstance(f, Frame)]
     bad = tuple((f.index, f.reason) for f in read if isinstance(f, BadFrame))
     clock.mark("read")
+    if not read:
+        raise SourceError(f"{task.path} has no frame {task.span.start} any more; is it still there, and complete?")
+    if not frames:
+        return (_without_geometry(task, source, frames, camera, bad, clock.seconds, discoverer),)
     try:
-        if not frames:
-            raise TrackingError("no frame of the chunk could be decoded")
         used, parts, repeats = reconstruct(task, source, frames, camera, _deep(task, read))
     except TrackingError as error:
-        return (replace(_without_geometry(task, frames, camera, bad, clock.seconds), lost_reason=str(error)),)
+        lost = _without_geometry(task, source, frames, camera, bad, clock.seconds, discoverer)
+        return (replace(lost, lost_reason=str(error)),)
     clock.mark("reconstruction")
     results = []
     for number, part in enumerate(parts, start=1):
@@ -171,9 +174,10 @@ def _posed(parts: Sequence[Reconstruction]) -> set[int]:
 
 
 def _deep(task: ChunkTask, read: Sequence[Frame | BadFrame]) -> set[int] | None:
-    """Numbers of the frames that get depth; None for all, as where they would be few."""
-    found = {f.index for k, f in enumerate(read, task.span.start) if k % task.depth_every == 0}
-    return None if task.depth_every == 1 or 4 * len(found) < task.settings.chunks.length else found
+    """Numbers of the frames that get depth; None for all, as where they would be few of those that can be used."""
+    every = task.depth_every
+    found = {f.index for k, f in enumerate(read, task.span.start) if k % every == 0 and isinstance(f, Frame)}
+    return None if every == 1 or 4 * len(found) < task.settings.chunks.length else found
 
 
 def _around(task: ChunkTask, source: FrameSource) -> Around | None:
@@ -278,13 +282,19 @@ def _result(
 
 def _without_geometry(
     task: ChunkTask,
+    source: FrameSource,
     frames: Sequence[Frame],
     camera: Camera,
     bad: tuple[tuple[int, str], ...],
     seconds: dict[str, float],
+    discoverer: Discoverer | None,
 ) -> ChunkResult:
-    """A chunk through which the camera could not be followed: its frames are kept as lost."""
-    count = len(frames)
+    """A chunk through which the camera could not be followed, or without frames: those it has are kept as lost.
+
+    It is of the scale and the feature space of the chunks around it, so that it changes nothing for them.
+    """
+    count, s = len(frames), task.settings
+    sensed = entry(s.reconstruction).needs_depth and source.info.has_depth
     empty = Reconstruction(
         frame_indices=np.array([f.index for f in frames], np.int64),
         posed=np.zeros(count, bool),
@@ -292,10 +302,11 @@ def _without_geometry(
         camera=camera,
         depth=np.zeros((count, camera.height, camera.width), np.float32),
         confidence=np.zeros((count, camera.height, camera.width), np.float16),
-        scale_kind="metric" if any(f.depth is not None for f in frames) else "relative",
+        scale_kind="metric" if sensed or s.poses == "given" else "relative",
         keyframes=np.zeros(0, np.int64),
     )
-    library = LocalLibrary((), np.zeros((0, 2), np.int32), FEATURE_SPACE)
+    space = (discoverer or _instance_models(s)[0]).feature_space
+    library = LocalLibrary((), np.zeros((0, 2), np.int32), space)
     return replace(_result(task, frames, empty, library, FrameSamples.empty(), ()), bad_frames=bad, seconds=seconds)
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from list3r.memory.errors import MissingPackageError, OptionError
+from list3r.memory.errors import MissingPackageError, OptionError, install_hint
 
 
 class RayCluster:
@@ -22,7 +22,7 @@ class RayCluster:
             ray: Any = importlib.import_module("ray")
         except ModuleNotFoundError:
             raise MissingPackageError(
-                "--engine ray needs ray, which is not installed: pip install 'list3r[ray]'"
+                f"--engine ray needs ray, which is not installed: {install_hint('ray')}"
             ) from None
         self._ray = ray
         self.errors: Any = ray.exceptions

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from list3r.memory.description.printable import shown_between
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
@@ -96,7 +97,8 @@ def _standing(
             score = c.score * confidence * (0.5 + 0.5 * object.score)
             if subject not in best or score > best[subject].score:
                 o = object.instance
-                why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{via})"
+                name = shown_between(o.label or o.description, ";")
+                why = f"{predicate.replace('_', ' ')} #{o.id} {name} ({confidence:.2f}{via})"
                 inner = tuple(r for r in object.reasons if not r.startswith(("named", "#")))
                 best[subject] = PhraseMatch(c.instance, score, (*c.reasons, why, *inner))
     return [best[n] for n in sorted(best)]

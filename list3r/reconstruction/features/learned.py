@@ -1,18 +1,13 @@
-"""Learned local features: what a network gives, how it is made by its name, how descriptors are stored as bytes."""
+"""Learned local features: what a network gives, and how descriptors are stored as bytes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import OptionError
-
-KINDS = ("aliked",)
-"""Networks by name; decision 0060 says why there is no other."""
 LEARNED_WIDTH = 256
 """Bytes of a stored descriptor, unlike SIFT's 128, so that the width names the kind."""
 
@@ -35,15 +30,6 @@ class LearnedDetector(Protocol):
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
         """Return the `count` surest features of a picture (H, W, 3)."""
         ...
-
-
-def make_detector(kind: str, weights: Path, device: str = "cpu") -> LearnedDetector:
-    """Return the detector of a name, which is imported when it is asked for. Raises `OptionError`."""
-    if kind not in KINDS:
-        raise OptionError(f"local features {kind} are not known; choose one of sift, {', '.join(KINDS)}")
-    from list3r.reconstruction.features.aliked import Aliked
-
-    return Aliked(weights, device)
 
 
 def as_bytes(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@ into a compact image representation", 2010, with the normalisation within each w
 about VLAD", 2013).
 
 The vocabulary lies beside this file and was learned on simulated rooms, so that a chunk's descriptors depend on that
-chunk alone, and frames of different videos can be compared (decision 0061).
+chunk alone, and frames of different videos can be compared (research/association 0061).
 """
 
 from __future__ import annotations

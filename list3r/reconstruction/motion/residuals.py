@@ -1,7 +1,7 @@
 """Find movers in residuals: surfaces that disagree with the motion that the rest of the picture determines.
 
 Two explanations, with and without a whole surface, are compared by a vote of pixels. A robust kernel over single pixels
-cannot tell a large near mover from the background: both agree half (decision 0063).
+cannot tell a large near mover from the background: both agree half (research/depth-odometry 0063).
 """
 
 from __future__ import annotations

@@ -156,7 +156,7 @@ def rims_out(depth: DepthMap, reach: int, step: float) -> DepthMap:
     """Depth without the outer pixels of what stands before something farther: within `reach` px of a `step` of depth.
 
     Windows at an outline hold both surfaces, so that what stands in front comes out wider than it is
-    (docs/decisions/0187-rims-of-computed-depth.md). `step` is a share of depth, beyond what a plane changes there.
+    (research/colour-video 0187). `step` is a share of depth, beyond what a plane changes there.
     """
     inverse, known = depth.inverse, depth.inverse > 0
     none = torch.full((), _NEAREST, device=inverse.device)

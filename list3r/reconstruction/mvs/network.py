@@ -1,7 +1,7 @@
 """A network that reads depth from the costs of a plane sweep and the picture, and says how far it may be off.
 
 A small U-Net: the costs of 64 depths tell where something matches, the picture what belongs together where nothing
-does. It learned from rooms made from seeds (`training/sweep.py`, MODEL_CARD.md, decision 0199).
+does. It learned from rooms made from seeds (`training/sweep.py`, MODEL_CARD.md, research/colour-video 0199).
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ class MatchTrustSettings:
 
 @dataclass(frozen=True)
 class SweepNetworkSettings:
-    """What of the network's depth is taken where matches tell none (decision 0199)."""
+    """What of the network's depth is taken where matches tell none (research/colour-video 0199)."""
 
     most_error: float = 0.06
     """Mean error that it expects, share of depth, above which it is left out."""

@@ -3,8 +3,8 @@
 A frame is accepted only when enough of the model is seen, agrees in depth and brightness, the pairs determine every
 motion, and the motion is possible. A frame that fails, that has no known motion before it, or that agrees much less
 than its forerunners is sought by local features and by starts all round the last pose; where that fails too a new
-segment begins. Segments are joined afterwards by verified geometry only (decision 0062). What moves before the camera
-is left out (decision 0063).
+segment begins. Segments are joined afterwards by verified geometry only (research/depth-odometry 0062). What moves
+before the camera is left out (research/depth-odometry 0063).
 """
 
 from __future__ import annotations

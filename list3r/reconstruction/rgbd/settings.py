@@ -132,4 +132,4 @@ class RgbdSettings:
     movers: FreeSpaceMoverSettings = field(default_factory=FreeSpaceMoverSettings, metadata={"formerly": "moving"})
     mover_tracks: MoverTrackSettings = field(default_factory=MoverTrackSettings, metadata={"formerly": "follow"})
     most_step: int = 2
-    """Largest step between frames of a slow video that get depth, unless another is asked for (decision 0159)."""
+    """Largest step between frames of a slow video that get depth, unless another is asked for (research/speed 0159)."""

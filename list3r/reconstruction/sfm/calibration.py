@@ -1,7 +1,8 @@
 """Estimate the lens of an RGB source once before its chunks: focal length and radial distortion.
 
 Windows spread over the video are mapped each by itself with a free camera, and then adjusted together with one camera
-for all. A window's parallax decides how much it says. All chunks use the camera that was found (decision 0069).
+for all. A window's parallax decides how much it says. All chunks use the camera that was found (research/colour-video
+0069).
 """
 
 from __future__ import annotations

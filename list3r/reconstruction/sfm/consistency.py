@@ -2,7 +2,7 @@
 
 Growing a map adds a keyframe when a few dozen of its points fit a pose; matches with other keyframes that contradict it
 are then dropped. Here they are asked again: of what verified two-view geometry relates, most must lie on the epipolar
-lines that the map's poses give (decision 0065).
+lines that the map's poses give (research/colour-video 0065).
 """
 
 from __future__ import annotations

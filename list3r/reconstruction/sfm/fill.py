@@ -132,7 +132,8 @@ def pose_of(
 
 _ITERATIONS, _ROUNDS = 3, 6
 """Steps of a refinement, after which it is asked anew which points agree, until they are the same, and how often that
-is at the most. The last steps to a minimum change the error of a path by hundredths of a millimetre (decision 0183)."""
+is at the most. The last steps to a minimum change the error of a path by hundredths of a millimetre (research/speed
+0183)."""
 
 
 def _refined(

@@ -2,10 +2,10 @@
 
 A map that grows keyframe by keyframe passes its scale on from one to the next. Where the camera turns on the spot it
 can slip into a local minimum: two halves that each are right, one of them larger by a tenth up to twice, which more
-adjustment does not mend (decision 0208). Global structure from motion (Pan et al., "Global Structure-from-Motion
-Revisited", ECCV 2024, as pycolmap has it) averages rotations and places all cameras and points together. It takes
-several times as long, so it is asked only where turns lose scale or a map leaves apart what shares matches; what
-explains more of the pictures is kept.
+adjustment does not mend (research/colour-video 0208). Global structure from motion (Pan et al., "Global
+Structure-from-Motion Revisited", ECCV 2024, as pycolmap has it) averages rotations and places all cameras and points
+together. It takes several times as long, so it is asked only where turns lose scale or a map leaves apart what shares
+matches; what explains more of the pictures is kept.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Corners tie keyframes of one run of tracks. Where all tracks ended at once, keyframes of all runs that look alike are
 matched by local features. Frames before and behind the chunk are mapped with it, and all keyframes are matched by
-features as well, because corners alone bend a chunk with little motion (decision 0065).
+features as well, because corners alone bend a chunk with little motion (research/colour-video 0065).
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 Nothing touches the disk: the correspondences lie in a database in memory. pycolmap's pixels have their origin at the
 corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
 correspondences give the same structure. Growing a map is a local search, so maps are grown from pairs in up to three
-places of a chunk (decision 0064), roughly, and the one that is kept is adjusted once it is whole (decision 0181).
+places of a chunk (research/colour-video 0064), roughly, and the one that is kept is adjusted once it is whole
+(research/colour-video 0181).
 """
 
 from __future__ import annotations

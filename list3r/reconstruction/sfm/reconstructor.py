@@ -20,7 +20,8 @@ from list3r.frames.decoding.picture import gray_of
 from list3r.memory.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
-from list3r.reconstruction.features.learned import LearnedDetector, make_detector
+from list3r.reconstruction.features.detectors import make_detector
+from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, stereo_noise
 from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions

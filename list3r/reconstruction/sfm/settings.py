@@ -98,7 +98,8 @@ class LinkSettings:
     ahead_features: int = 600
     """Features of each for that,"""
     ahead_width: int = 448
-    """and the width of the pictures. It takes half the time of 640, and maps come out alike (decision 0182)."""
+    """and the width of the pictures. It takes half the time of 640, and maps come out alike (research/colour-video
+    0182)."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,8 @@ class MappingSettings:
     """Adjustments end when a step gains less than this share of the error."""
     turned_scale: float = 0.0
     """A map of all keyframes at once is tried where turns lose that much of the scale, or maps leave apart what shares
-    matches; 0 for never. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046 (decision 0208)."""
+    matches; 0 for never. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046 (research/colour-video
+    0208)."""
     alike: float = 0.95
     """Maps with at least this share of the keyframes of the largest are compared by their error."""
     point_angle_deg: float = 1.0
@@ -202,7 +204,8 @@ class AdjustmentSettings:
     iterations: int = 30
     """Most of the last round;"""
     early_iterations: tuple[int, ...] = (5, 10)
-    """and of those before it, which still hold outliers: poses are as near to the truth as with 30 (decision 0145)."""
+    """and of those before it, which still hold outliers: poses are as near to the truth as with 30
+    (research/colour-video 0145)."""
     least_points: int = 12
     """Fewest points of a keyframe whose pose is believed."""
     mapping: MappingSettings = field(default_factory=MappingSettings)
@@ -282,7 +285,7 @@ class CameraCalibrationSettings:
 
 def maps_of_chunks() -> MappingSettings:
     """Return how the keyframes of a chunk are mapped: maps settle, and grow roughly, which is as near to the truth and
-    to the pictures (docs/decisions/0157 and 0181)."""
+    to the pictures (research/speed 0157 and 0181)."""
     return MappingSettings(
         settled=1e-4, growth=2.0, part_iterations=5, part_rounds=1, part_views=4, rough_iterations=10, turned_scale=0.05
     )

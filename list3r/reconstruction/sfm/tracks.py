@@ -6,7 +6,7 @@ that a track does not creep.
 Frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where nearly all
 corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in those too
 (a jerk) all tracks end and a new run of tracks begins. Pictures are first brought to one brightness where the camera
-changed it (decision 0070).
+changed it (research/colour-video 0070).
 """
 
 from __future__ import annotations

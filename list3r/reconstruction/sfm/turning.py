@@ -2,7 +2,7 @@
 
 With a focal length that is wrong, or left free, structure from motion makes a map of such pictures too. So for pairs of
 views the best rotation is asked for at focal lengths around the camera's: x_b ~ K R K^-1 x_a (Hartley and Zisserman,
-Multiple View Geometry, 8.4.2; decision 0071).
+Multiple View Geometry, 8.4.2; research/colour-video 0071).
 """
 
 from __future__ import annotations

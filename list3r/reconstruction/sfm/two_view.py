@@ -1,7 +1,7 @@
 """Matches that agree on the geometry of two views of one known camera.
 
 OpenCV's MAGSAC (Barath et al., "MAGSAC++, a fast, reliable and accurate robust estimator", CVPR 2020) takes an eighth
-of the time of the three models that pycolmap fits, and keeps the same matches (decision 0075).
+of the time of the three models that pycolmap fits, and keeps the same matches (research/colour-video 0075).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 What things match is found by `matching`, where exactly by `surface_fit`; a relation is accepted by the evidence for it
 together: how many things agree and how well, that no other place fits nearly as well, how much of the surfaces meets
 and that neither chunk sees through what the other saw. The weights were chosen on simulated homes
-(docs/decisions/0053).
+(research/association 0053).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RelationOdds:
-    """Log odds that a relation is right, fitted to 277 of them in 27 simulated homes (docs/decisions/0053)."""
+    """Log odds that a relation is right, fitted to 277 of them in 27 simulated homes (research/association 0053)."""
 
     bias: float = -3.1
     match: float = 0.89

@@ -60,7 +60,7 @@ class ThingSearchSettings:
     """Least difference of the log odds of a believed relation and of any that puts the new chunk elsewhere."""
     elsewhere: float = 1.5
     """Deviations of the way between two relations from which on they name two places. What lies in one is mostly found
-    within 0.3; look-alike rooms of one floor lie 2.7 and more apart (docs/decisions/0147)."""
+    within 0.3; look-alike rooms of one floor lie 2.7 and more apart (research/association 0147)."""
     surroundings: SurroundingsSettings = field(default_factory=SurroundingsSettings)
     registration: ConstellationRegistrationSettings = field(default_factory=ConstellationRegistrationSettings)
 

@@ -1,7 +1,7 @@
 """Gather what surrounds a chunk: it and its neighbours in time, laid in its frame as if they were one chunk.
 
 A single chunk holds few things, most of them seen from one side, and in a symmetric room they fit the wrong way round
-as well. Its neighbours add things that do not fit there, and other sides of those that do (docs/decisions/0147).
+as well. Its neighbours add things that do not fit there, and other sides of those that do (research/association 0147).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Few frames of a changed room in another light look alike, so every keyframe is compared with every other one. What was
 moved then supports wrong places, often with more keyframes than one; so relations that put the chunk at one place
-are taken together, and the whole of both chunks decides between the places (`chunk_agreement`, docs/decisions/0134).
+are taken together, and the whole of both chunks decides between the places (`chunk_agreement`, research/sessions 0134).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A relation of two keyframes can rest on a thing that was moved, or that looks like another. Then walls, floor and all
 that stayed lie elsewhere: what one chunk saw lies in the free space of the other. What the two keyframes saw
 themselves is left out, so that the rest is independent evidence. Along two walls and the floor a room can be shifted
-and they still agree, so it counts how much agrees of what faces the way that agrees least (docs/decisions/0134).
+and they still agree, so it counts how much agrees of what faces the way that agrees least (research/sessions 0134).
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns, arrays, joined
 from list3r.memory.store.rows.table import Table
 from list3r.memory.store.tables.frames import Frames, Keyframes
-from list3r.memory.store.tables.library import LibraryState
 from list3r.memory.store.tables.local_instances import LocalInstances
 
 _INTRINSICS = joined(("fx", "fy", "cx", "cy"), ("intrinsics",), tuple, lambda *px: (px,))
@@ -28,6 +27,14 @@ _encode_samples, _decode_samples = arrays(
     T_chunk_cam=lambda _: np.zeros((0, 4, 4)),
 )
 _SAMPLES = joined(("overlap",), ("samples",), lambda s: (_encode_samples(s),), lambda blob: (_decode_samples(blob),))
+
+_BLANK = """
+    SELECT chunk_id FROM chunks c
+    WHERE NOT EXISTS (SELECT 1 FROM keyframes k WHERE k.chunk_id = c.chunk_id)
+      AND NOT EXISTS (SELECT 1 FROM local_instances i WHERE i.chunk_id = c.chunk_id)
+      AND NOT EXISTS (SELECT 1 FROM frames f WHERE f.session_id = c.session_id AND f.chunk_id = c.chunk_id
+                      AND f.frame_index BETWEEN c.first_frame AND c.last_frame AND f.state = 'posed')
+"""
 
 
 @dataclass(frozen=True)
@@ -66,13 +73,11 @@ class Chunks:
         frames: Frames,
         keyframes: Keyframes,
         local_instances: LocalInstances,
-        library: LibraryState,
     ) -> None:
         self._connection = connection
         self._frames = frames
         self._keyframes = keyframes
         self._local_instances = local_instances
-        self._library = library
         measured = Columns.of(_Measured, _INTRINSICS, _IMAGE_SIZE, _SAMPLES, index="chunk_index")
         self._measured = Table(connection, "chunks", measured, "chunk_id", summed=("cannot_link", "overlap"))
         self._placements = Table(connection, "placements", Columns.of(_Placement), "chunk_id")
@@ -87,14 +92,16 @@ class Chunks:
     def add(self, session_id: int, result: ChunkResult) -> int:
         """Store one chunk as its own component with the identity as `S_world_chunk`; its id.
 
-        Of the frames that it shares with the chunk before, the second half comes to be placed by the new chunk.
+        Of the frames that it shares with the chunk before, the second half comes to be placed by the new chunk. One of
+        whose frames none could be used spans those.
         """
+        seen = result.frame_indices.tolist() or [index for index, _ in result.bad_frames]
         chunk_id = self._measured.add(
             _Measured(
                 session_id,
                 result.index,
-                int(result.frame_indices[0]),
-                int(result.frame_indices[-1]),
+                seen[0],
+                seen[-1],
                 result.intrinsics,
                 result.image_size,
                 result.scale_kind,
@@ -107,7 +114,6 @@ class Chunks:
         self._placements.put([_Placement(chunk_id, chunk_id, Sim3.identity(), None)])
         if self._known is not None:
             self._known = {**self._known, **{c.chunk_id: c for c in self._placed.all("chunk_id = ?", (chunk_id,))}}
-        self._library.touch([chunk_id])
         self._frames.add(session_id, chunk_id, result)
         self._keyframes.add(chunk_id, result.keyframes)
         for instance in result.library.instances:
@@ -126,6 +132,10 @@ class Chunks:
         if found is None:
             raise MemoryFileError(f"{self._connection.path} has no chunk {chunk_id}")
         return found
+
+    def blank(self) -> frozenset[int]:
+        """Return ids of the chunks that hold nothing: no frame with a pose, no keyframe, no local instance."""
+        return frozenset(int(k) for (k,) in self._connection.rows(_BLANK))
 
     def place(
         self,
@@ -147,7 +157,6 @@ class Chunks:
                 rows[k] = after
         self._placements.put(_Placement(k, rows[k].component, rows[k].S_world_chunk, rows[k].covariance) for k in fresh)
         self._known = rows
-        self._library.touch(fresh)
 
     def place_unplaced(self) -> list[int]:
         """Give every chunk without a place one of its own, as repair needs it; their ids."""

@@ -55,7 +55,7 @@ class Frames:
 
     def add(self, session_id: int, chunk_id: int, result: ChunkResult) -> None:
         """Store the frames of a chunk; of those that it shares with the chunk before it places the second half."""
-        first = int(min(result.frame_indices[0], *[b[0] for b in result.bad_frames], 2**62))
+        first = min([*result.frame_indices[:1].tolist(), *[index for index, _ in result.bad_frames]])
         query = "SELECT frame_index, state FROM frames WHERE session_id = ? AND frame_index >= ?"
         known = dict(self._connection.rows(query, (session_id, first)))
         shared = [int(i) for i in result.frame_indices if int(i) in known]

@@ -20,7 +20,6 @@ from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.labels import DetectedLabels
-from list3r.memory.store.tables.library import Anchors, LooksTable
 from list3r.memory.store.tables.relations import RelationTable
 from list3r.memory.store.tables.words import Words
 
@@ -149,21 +148,12 @@ class Instances:
         self._words.put(records)
         self._put_boxes((i.id, i.aabb) for i in records)
 
-    def set_places(self, instances: Iterable[Instance]) -> None:
-        """Write where instances that are there lie, and how surely: all that moving them changes."""
-        records = list(instances)
-        self._connection.execute_many(
-            f"UPDATE instances SET {' = ?, '.join(_GEOMETRY)} = ?, position_sigma_m = ? WHERE id = ?",
-            [(*_pack_geometry(i.center, i.aabb, i.box), i.position_sigma_m, i.id) for i in records],
-        )
-        self._put_boxes((i.id, i.aabb) for i in records)
-
     def drop(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
         self._rows.delete("id = ?", (instance_id,))
         self._connection.execute("DELETE FROM instance_boxes WHERE id = ?", (instance_id,))
         self._words.drop(instance_id)
-        for table in (Embeddings, Anchors, LooksTable, DetectedLabels):
+        for table in (Embeddings, DetectedLabels):
             table(self._connection).drop(instance_id)
         RelationTable(self._connection, self._ids).drop(instance_id)
         Events(self._connection).drop(instance_id, alias_of)
@@ -186,16 +176,6 @@ class Instances:
             self._ranked = self._ranked.with_more(_ranks(list(rows)))
         held = wanted[_is_in(wanted, self._ranked.ids)]
         return self._ranked.among(np.searchsorted(self._ranked.ids, held))
-
-    def states(self) -> dict[int, tuple[str, int]]:
-        """Return state and component of every instance, by id."""
-        rows = self._connection.rows("SELECT id, state, component FROM instances")
-        return {n: (state, component) for n, state, component in rows}
-
-    def set_states(self, states: Mapping[int, str]) -> None:
-        """Write the state of instances, by id."""
-        statement = "UPDATE instances SET state = ? WHERE id = ?"
-        self._connection.execute_many(statement, [(state, n) for n, state in sorted(states.items())])
 
     def set_labels(self, labels: Mapping[int, str | None]) -> None:
         """Name instances, by id; None takes a name away."""

@@ -31,14 +31,9 @@ class LabelVotes:
     def __init__(self, connection: Connection) -> None:
         columns = Columns.of(_Vote, nested("votes", Columns.of(Votes)))
         self._rows = Table(connection, "votes", columns, "chunk_id, local_id, source")
-        self.turned = 0
-        """Grows when votes come to a chunk from which something may have been concluded before."""
 
-    def put(self, chunk_id: int, source: str, votes: Mapping[int, Votes], *, fresh: bool = False) -> None:
-        """Keep what a source saw of a chunk, by local id, instead of what the same one saw before; `fresh` of a chunk
-        that has just come in.
-        """
-        self.turned += not fresh
+    def put(self, chunk_id: int, source: str, votes: Mapping[int, Votes]) -> None:
+        """Keep what a source saw of a chunk, by local id, instead of what the same one saw before."""
         self._rows.delete("chunk_id = ? AND source = ?", (chunk_id, source))
         self._rows.put(_Vote(chunk_id, n, source, found) for n, found in sorted(votes.items()))
 

@@ -15,7 +15,6 @@ from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import dequantise, pack, quantise, raw_array, unpack
 from list3r.memory.store.rows.columns import Columns, joined, nested
 from list3r.memory.store.rows.table import Table, batches
-from list3r.memory.store.tables.library import LibraryState
 
 
 @dataclass(frozen=True)
@@ -157,10 +156,9 @@ class Supports:
 class LocalInstances:
     """The table of local instances. What writes is called inside `transaction()`."""
 
-    def __init__(self, connection: Connection, supports: Supports, library: LibraryState) -> None:
+    def __init__(self, connection: Connection, supports: Supports) -> None:
         self._connection = connection
         self._supports = supports
-        self._library = library
         order = "chunk_id, local_id"
         columns = Columns.of(_LocalRow, nested("instance", _INSTANCE))
         self._rows = Table(connection, "local_instances", columns, order)
@@ -170,7 +168,6 @@ class LocalInstances:
 
     def add(self, chunk_id: int, instance: LocalInstance, *, scrap: bool = False) -> None:
         """Store one more local instance or scrap of a chunk, under a local id that the chunk does not have yet."""
-        self._library.unsettle(chunk_id)
         self._rows.add(_LocalRow(chunk_id, instance, scrap))
         self._supports.add(chunk_id, instance.local_id, instance.support)
 
@@ -214,8 +211,6 @@ class LocalInstances:
             "UPDATE local_instances SET dynamic = 1, motion = coalesce(?, motion) WHERE chunk_id = ? AND local_id = ?",
             [(motion, chunk_id, n) for n, motion in zip(motions, packed, strict=True)],
         )
-        if motions:
-            self._library.unsettle(chunk_id)
 
     def dynamic(self, chunk_id: int) -> list[int]:
         """Return the local ids of a chunk's instances that move."""

@@ -12,8 +12,8 @@ from list3r.memory.store.rows.table import Table
 
 _OF_CHUNKS = (
     ("edges", ("u", "v")),
-    ("overlaps", ("u", "v")),
-    *((table, ("chunk_id",)) for table in ("placements", "settled", "bends", "keyframes", "supports", "members")),
+    ("pair_scores", ("u", "v")),
+    *((table, ("chunk_id",)) for table in ("placements", "bends", "keyframes", "supports")),
     *((table, ("chunk_id",)) for table in ("local_instances", "votes")),
 )
 """Tables of what chunks hold, and the columns that name the chunks."""

@@ -1,0 +1,19 @@
+"""Detectors of learned local features by name; each is imported when it is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from list3r.memory.errors import OptionError
+from list3r.reconstruction.features.learned import LearnedDetector
+
+KINDS = ("aliked",)
+
+
+def make_detector(kind: str, weights: Path, device: str = "cpu") -> LearnedDetector:
+    """Return the detector of a name, which is imported when it is asked for. Raises `OptionError`."""
+    if kind not in KINDS:
+        raise OptionError(f"local features {kind} are not known; choose one of sift, {', '.join(KINDS)}")
+    from list3r.reconstruction.features.aliked import Aliked
+
+    return Aliked(weights, device)
