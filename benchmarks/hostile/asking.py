@@ -20,8 +20,7 @@ from pathlib import Path
 from machine import end_with_parent
 
 from list3r.cli.app import run
-from list3r.exporters.plan import picture
-from list3r.exporters.plan.layout import PlanSettings
+from list3r.exporters.plan import drawing
 from list3r.exporters.registry import FORMATS
 from list3r.exporters.simready import thumbnail
 
@@ -125,9 +124,7 @@ def command_on(memory: Path, command: str, folder: Path) -> list[str]:
 
 def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> None:
     """Run every command about a sound memory: all must answer. Makes those that follow as fast as they can be."""
-    picture.PlanSettings = functools.partial(  # type: ignore[assignment, misc]
-        PlanSettings, width_px=400, legend_px=4, min_map_px=50, max_map_px=100
-    )
+    drawing.PlanSettings = functools.partial(drawing.PlanSettings, width_px=700, max_map_px=100)  # type: ignore[assignment, misc]
     thumbnail._SIDE_PX = 16
     for command in commands:
         ended = ask(command_on(memory, command, folder))

@@ -94,7 +94,7 @@ def begin_marking(database: Database) -> None:
             if _held(database) is None:
                 raise
             return
-    layout = int(database.execute("PRAGMA schema_version").fetchall()[0][0])
+    layout = int(database.execute("PRAGMA schema_version").fetchall()[0][0])  # type: ignore[arg-type]
     mark = Mark(secrets.token_bytes(16), 0, layout)
     with database.writing_into_the_file():
         database.begin("IMMEDIATE")

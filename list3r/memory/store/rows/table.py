@@ -45,6 +45,16 @@ class Table(Generic[R]):
         condition = f" WHERE {where}" if where else ""
         return self._records(f"{self._select}{condition} ORDER BY {self._order}", arguments)
 
+    def in_batches(self, size: int = 1024) -> Iterator[list[R]]:
+        """Yield all records in the order of the one integer that is their key, so many at a time: a large table takes
+        no more room, and those that were yielded may be written.
+        """
+        query = f"{self._select} WHERE {self._order} > ? ORDER BY {self._order} LIMIT {size}"
+        last = -1
+        while records := self._records(query, (last,)):
+            yield records
+            last = getattr(records[-1], self._order)
+
     def first(self, where: str, arguments: Arguments = ()) -> R | None:
         """Return one record for which a condition holds."""
         found = self._records(f"{self._select} WHERE {where} LIMIT 1", arguments)
