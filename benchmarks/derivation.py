@@ -10,7 +10,7 @@ with nothing new, an operator's merge; most memory of the process; and what is l
 walk that were found (middle within 10 cm, diagonal within half as much again), relations.
 
 With `--keep FOLDER` what is listed is written there, and with `--against FOLDER` it is compared with what another
-version wrote: things with a like (boxes overlap by 0.9), relations that both tell of those.
+version wrote: instances with a like (boxes overlap by 0.9), relations that both tell of those.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ from machine import machine, write_json
 from list3r.memory.geometry import Sim3, rotation_exp
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.maintenance import edits
-from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.records import ChunkResult, Instance
+from list3r.memory.records import ChunkResult
 from list3r.memory.store.store import Store
 
 WALKS = {"walk": ("rooms", 300), "stay": ("stay", 200), "sessions": ("rooms", 15), "corridor": ("corridor", 1000)}
@@ -97,7 +96,7 @@ def measure(name: str, words: argparse.Namespace) -> tuple[dict[str, Any], dict[
             "peak_mb": peak,
             "file_mb": round(store.path.stat().st_size / 1e6, 1),
             "things": len(things),
-            "listed": len(listed["ids"]),
+            "listed": sum(listed["things"]),
             "found": found_of(things, listed),
             "relations": len(listed["relations"]),
         }
@@ -169,21 +168,19 @@ def truth(store: Store, name: str, chunks: int, seed: int) -> np.ndarray:
 
 
 def what_is_listed(store: Store) -> dict[str, Any]:
-    """Boxes of the things, those of structure, and relations."""
-    things: list[Instance] = store.instances.all()
-    members: dict[int, list[Key]] = {}
-    for o in store.observations.all():
-        members.setdefault(o.instance_id, []).append((o.chunk_id, o.local_id))
+    """Boxes of all instances, which of them are things, and relations."""
+    found = store.instances.all()
     return {
-        "ids": [i.id for i in things if i.structure is None],
-        "boxes": [np.round(i.aabb, 4).tolist() for i in things if i.structure is None],
+        "ids": [i.id for i in found],
+        "things": [i.structure is None for i in found],
+        "boxes": [np.round(i.aabb, 4).tolist() for i in found],
         "relations": sorted([r.subject, r.predicate, r.object] for r in store.relations.all()),
     }
 
 
 def found_of(things: np.ndarray, listed: dict[str, Any]) -> int:
     """How many things of the walk are listed."""
-    boxes = np.array(listed["boxes"]).reshape(-1, 2, 3)
+    boxes = np.array(listed["boxes"]).reshape(-1, 2, 3)[np.array(listed["things"], bool)]
     middle, size = boxes.mean(axis=1), np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1)
     near = np.linalg.norm(things[:, None, :3] - middle, axis=2) < 0.1
     ratio = things[:, None, 3] / np.maximum(size, 1e-9)
@@ -201,7 +198,7 @@ def compared(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
             like[now["ids"][n]] = before["ids"][int(iou.argmax())]
     told = {tuple(r) for r in before["relations"]}
     both = sum((like.get(s, s), p, like.get(o, o)) in told for s, p, o in now["relations"])
-    return {"listed_before": len(b), "alike": len(like), "same_ids": sum(k == v for k, v in like.items())} | {
+    return {"instances_before": len(b), "alike": len(like), "same_ids": sum(k == v for k, v in like.items())} | {
         "relations_before": len(told),
         "relations_alike": both,
     }

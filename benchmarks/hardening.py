@@ -1,13 +1,7 @@
-"""What hostile files and words do to the program: lies, damages, command lines, bombs, and the list of what was found.
+"""What hostile files and words do to the program: command lines and bombs. What damage does: `damage.py`.
 
-    python benchmarks/hardening.py --lies 10000 --damages 1000 --command-lines 2000 --bombs \\
-        --json benchmarks/results/hardening.json
+    python benchmarks/hardening.py --command-lines 2000 --bombs --json benchmarks/results/hardening.json
 
-    python benchmarks/hardening.py --list --json benchmarks/results/hardening-findings.json
-
-`--list`: what an attack on version 0.1 found, row by row, in the last checkout before it was mended and in this one.
-
-`--lies`: memories of valid checksums that hold nonsense, each through all commands that read, all exports and an edit.
 None may end in a traceback, take over 10 s of a processor or 1 GB. The rest is said in `hostile/`. Two processes of the
 lowest priority; the same command goes on where it was ended.
 """
@@ -26,7 +20,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # the small memories of the tests
 
-from hostile import before_after, bombs, command_lines, damages, lying
+from hostile import bombs, command_lines
 from hostile.work import Batch, Run
 
 EACH = 50
@@ -35,23 +29,14 @@ EACH = 50
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lies", type=int, default=0)
-    parser.add_argument("--damages", type=int, default=0)
     parser.add_argument("--command-lines", type=int, default=0)
     parser.add_argument("--bombs", action="store_true")
-    parser.add_argument("--list", action="store_true", help="in a file of its own")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    if args.list:
-        told = before_after.run_list(args.json)
-        print(before_after.table(told))
-        raise SystemExit(1 if before_after.open_rows(told) else 0)
     parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {
-        "damages": (damages.batch, args.damages),
         "command lines": (command_lines.batch, args.command_lines),
-        "lies": (lying.batch, args.lies),
     }
     problems = 0
     if args.bombs:

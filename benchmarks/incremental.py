@@ -234,7 +234,7 @@ def add(store: Store, result: ChunkResult, session: int = 1) -> dict[str, float]
         library_s = user_s() - started
         return report
 
-    before, started = len(store.embeddings.touched), user_s()
+    before, started = store.embeddings.changes(), user_s()
     mapping.consolidate = timed  # type: ignore[assignment]
     try:
         if session == 1:
@@ -248,7 +248,7 @@ def add(store: Store, result: ChunkResult, session: int = 1) -> dict[str, float]
     finally:
         mapping.consolidate = consolidate
     taken = user_s() - started
-    written = len(store.embeddings.touched) - before
+    written = sum(len(store.embeddings.changed(space, before)[0]) for space in store.embeddings.spaces())
     return {"placing_s": taken - library_s, "library_s": library_s, "all_s": taken, "written": written}
 
 

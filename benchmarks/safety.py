@@ -1,7 +1,7 @@
 """What a memory survives: kill -9 while it is built, updated and edited (`kills`), readers beside a writer, flipped
-bytes, truncation, lies with valid checksums (`hostile/lies.py`).
+bytes, truncation.
 
-    python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --lies 200 --json benchmarks/results/safety.json
+    python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --json benchmarks/results/safety.json
 
 Every process is real. The whole takes about half an hour on a quiet core; a part is written to the file as it is done,
 and the same command with --resume goes on after the last one.
@@ -25,7 +25,6 @@ from queue import Empty
 from typing import Any
 
 import numpy as np
-from hostile import lying
 from kills import build_command, kill_builds, kill_commands, kill_edits, kill_updates, kill_writes, update_command
 from machine import end_with_parent, machine, write_json
 
@@ -293,13 +292,12 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=200, help="in all: builds and updates 30 %% each, edits the rest")
     parser.add_argument("--minutes", type=float, default=5.0, help="how long eight readers and a writer run")
     parser.add_argument("--flips", type=int, default=1000)
-    parser.add_argument("--lies", type=int, default=200, help="memories of valid checksums that hold nonsense")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--resume", action="store_true", help="keep the parts that the file holds already")
     args = parser.parse_args()
     print(machine())
-    asked = {name: getattr(args, name) for name in ("kills", "minutes", "flips", "lies", "seed")}
+    asked = {name: getattr(args, name) for name in ("kills", "minutes", "flips", "seed")}
     result: Result = {"asked": asked}
     if args.resume and args.json is not None and args.json.exists():
         held = json.loads(args.json.read_text(encoding="utf-8"))
@@ -331,7 +329,6 @@ def _parts(folder: Path, args: argparse.Namespace) -> Iterator[tuple[str, Callab
         # A file of its own for each: what a killed writer left beside one belongs to no other.
         yield part, lambda k=kill, n=count: k(_copy(made.updated, k.__name__), n, seed + 2)
     yield "flips", lambda: flip(made.built, folder, args.flips, seed)
-    yield "lies", lambda: lying.tell(folder, seed, args.lies)
     yield "repairs", lambda: repair_flips(made.built, folder, args.flips // 10, seed + 1)
     yield "file_mb", lambda: round(made.built.stat().st_size / 1e6, 2)
     yield "verify_s", lambda: _verify_s(made.built)

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import Instance, Relation
-from list3r.memory.search.vector_cells import cache_file
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.nearest import nearest
@@ -109,7 +108,6 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
         row |= timed(f"find_{name}", [lambda text=text: find(store, text)] * 5, warm=1)
     row |= timed("words_near_point", [lambda p=p: nearest(store, point=p, words="noun7") for p in points[:10]])
     row |= timed("camera", [lambda p=p: visible(store, camera_in(p), max_depth=6.0) for p in points[:20]])
-    row["cells_kept_before"] = cache_file(path, SPACE).exists()
     started, spent = time.perf_counter(), time.process_time()
     similar(store, vector=asked[0], space=SPACE, k=10)
     row["similar_first_s"] = round(time.perf_counter() - started, 2)

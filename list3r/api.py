@@ -6,7 +6,6 @@ The module of a question is imported when it is asked, so that simple questions 
 from __future__ import annotations
 
 import functools
-import sqlite3
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -157,7 +156,7 @@ class SceneMemory(MemoryEdits):
 
         try:
             text = f"{self.path.name!r}: {describe_counts(self.store)}"
-        except (List3rError, sqlite3.Error):
+        except List3rError:
             text = f"{self.path.name!r}, closed"
         return f"<SceneMemory {text}>"
 

@@ -349,9 +349,11 @@ def test_redundant_chunks_follow_edits_and_moves(
     both = {(o.chunk_id, o.local_id) for i in things[:2] for o in store.observations.of(i)}
     edits.merge(store, things[0], things[1], "somebody")
     assert {(o.chunk_id, o.local_id) for o in store.observations.of(things[0])} == both
+    assert (5, 5) not in store.pair_scores.pairs()
     leaving = next(o for o in store.observations.of(things[2]) if o.chunk_id == 5)
     edits.split(store, things[2], [(5, leaving.local_id)], "somebody")
     assert {o.chunk_id for o in store.observations.of(things[2])} == {1, 2, 3, 4, 6}
+    assert (5, 5) in store.pair_scores.pairs()
     with store.transaction():
         store.chunks.place({6: Sim3.exp(np.array([0.0, 40.0, 0.0, 0, 0, 0, 0]))}, {6: 1})
     end(store)

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from list3r.memory.overlap.summaries import SummaryCache, sample_of
-from list3r.memory.store.checksums import side_by_side
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
 
@@ -99,10 +98,3 @@ def test_the_sample_of_a_longer_walk_is_some_of_the_earlier_one_and_later_chunks
     assert min(count, 33) <= len(sample) <= 64
     for longer in range(count, 2 * count):
         assert {k for k in sample_of(range(longer)) if k < count} <= set(sample)
-
-
-def test_parts_side_by_side_are_all_parts_in_runs_of_one_table() -> None:
-    parts = [("frames", (1 << 32) + k) for k in (0, 1, 2)] + [("chunks", k) for k in range(1500) if k != 7]
-    runs = list(side_by_side(reversed(parts)))
-    assert [(name, k) for name, run in runs for k in run] == sorted(parts)
-    assert [len(run) for _, run in runs] == [7, 1000, 492, 3]

@@ -311,17 +311,6 @@ def test_a_detector_says_nothing_against_what_it_does_not_know(memory: Path) -> 
         assert store.instances.get(red).label is None
 
 
-def test_votes_of_an_older_memory_have_the_name_of_their_detector(tmp_path: Path) -> None:
-    path = Path(shutil.copy(Path(__file__).parent / "fixtures" / "schema6.l3r", tmp_path / "old.l3r"))
-    with Store.open(path, writable=True) as store:
-        assert store.verify() == []
-        (votes,) = store.votes.of(1).values()
-        assert set(store.votes.of(1)) == {"old-net"} and set(votes) and votes[1].classes["cup"] == (4.0, 16.0)
-        (red,) = store.detected_labels.all()
-        say(store, red, Votes(0.5, {"bowl": (8.0, 40.0)}), source="new-net", classes=COCO_80)
-        assert store.detected_labels.all()[red].label == "bowl" and set(store.votes.of(1)) == {"old-net", "new-net"}
-
-
 def test_an_operator_has_the_last_word(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         red, blue = named(store, ROOM["red"].rgb), named(store, ROOM["blue"].rgb)

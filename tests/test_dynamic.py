@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 
 import jsonschema
@@ -16,12 +15,10 @@ from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict, scene_schema
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.records import Instance, LocalInstance, LocalLibrary, MotionTrack
-from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, local_instance
 
 FRAMES, STEP = 20, 14
-SCHEMA_1 = Path(__file__).parent / "fixtures" / "schema1.l3r"
 TABLE = ((2.0, 0.0, 0.36), (1.2, 0.8, 0.72), (150, 110, 70))
 FLOOR = ((2.0, 0.0, -0.01), (6.0, 6.0, 0.02), (120, 120, 120))
 
@@ -259,22 +256,3 @@ def test_the_stage_moves_it(tmp_path: Path) -> None:
     first, last = (np.array(prim.GetAttribute("xformOp:translate").Get(t)) for t in (samples[0], samples[-1]))
     assert np.allclose(last, person.box.center, atol=1e-6)
     assert np.allclose(last - first, np.subtract(across(STEP + FRAMES - 1), across(0)), atol=0.01)
-
-
-def test_a_memory_of_schema_1_opens_and_is_upgraded(tmp_path: Path) -> None:
-    path = tmp_path / "old.l3r"
-    shutil.copy(SCHEMA_1, path)
-    with Store.open(path, writable=True) as store:
-        assert store.verify() == []
-        assert len(store.instances.all()) == 6 and not moving(store)
-        assert all(i.position_sigma_m is None for i in store.instances.all())
-        (chunk_row,) = store.chunks.all()
-        assert chunk_row.covariance is None
-        samples = store.chunks.samples(chunk_row.chunk_id)
-        assert len(samples.points) and (samples.instance == -1).all()
-        assert store.local_instances.motion_track(chunk_row.chunk_id, 0) is None
-        with store.transaction():
-            consolidate(store)
-        assert store.verify() == []
-    with Store.open(path) as store:
-        assert store.connection._database.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION

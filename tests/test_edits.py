@@ -280,5 +280,5 @@ def test_a_damaged_edit_is_named(path: Path) -> None:
         with sqlite3.connect(path) as database:
             database.execute("UPDATE edits SET arguments = ?", (damage,))
         database.close()
-        with Store.open(path) as store, pytest.raises(MemoryFileError, match=r"damaged \(edits .*repair"):
+        with Store.open(path) as store, pytest.raises(MemoryFileError, match=r"damaged \(.*repair"):
             store.edits.all()

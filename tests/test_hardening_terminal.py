@@ -13,7 +13,7 @@ import pytest
 
 from list3r.cli.app import run
 from list3r.memory.description.printable import shown
-from list3r.memory.errors import OptionError
+from list3r.memory.errors import MemoryFileError, OptionError
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, MergeDecision
 from list3r.memory.store.store import Store
@@ -93,16 +93,20 @@ def test_letters_that_the_terminal_lacks_are_escaped(make_memory: Make) -> None:
         assert told.returncode == 0 and "Caf\\xe9" in told.stdout, told.stderr
 
 
-def test_a_path_that_is_no_text_is_a_path(tmp_path: Path) -> None:
+def test_a_path_that_is_no_text_is_refused_in_one_line(make_memory: Make, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"r\xffom.l3r")
-    with Store.create(path) as store, store.transaction():
-        write_small_room(store)
-    for command in (["list", path], ["label", path, "2", "mug"], ["show", path, "2"], ["verify", path]):
-        told = program(*command, capture_output=True)
-        assert (told.returncode, told.stderr) == (0, "")
-    for command in (["show", path, "77"], ["list", tmp_path / os.fsdecode(b"n\xff")]):
+    with pytest.raises(MemoryFileError, match="rename it"):
+        Store.create(path)
+    make_memory().rename(path)
+    for command in (
+        ["list", path],
+        ["label", path, "2", "mug"],
+        ["verify", path],
+        ["list", tmp_path / os.fsdecode(b"n\xff")],
+    ):
         told = program(*command, capture_output=True)
         assert told.returncode == 2 and told.stderr.count("\n") == 1 and "Traceback" not in told.stderr
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

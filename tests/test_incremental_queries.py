@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import sqlite3
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,7 @@ from list3r.memory.maintenance.temporary_views import store_shown
 from list3r.memory.records import Instance
 from list3r.memory.search import vectors
 from list3r.memory.search.vectors import VectorIndex
-from list3r.memory.store.checksums import summed_tables, write_table
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables.embeddings import Embeddings
 from list3r.queries.match import Filters
 from list3r.queries.nearest import nearest
 from list3r.queries.similar import similar
@@ -172,7 +169,7 @@ def test_filters_that_few_pass_are_served_in_full(store: Store, monkeypatch: pyt
     assert [m.instance.id for m in found] == sorted(removed, key=lambda n: -known[n])[:6]
 
 
-def test_cells_are_kept_and_followed_by_what_changes(
+def test_an_index_is_kept_and_followed_by_what_changes(
     store: Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(vectors, "_EXACT", 50)
@@ -180,79 +177,58 @@ def test_cells_are_kept_and_followed_by_what_changes(
     monkeypatch.setenv("LIST3R_CACHE", str(tmp_path / "cache"))
     query = np.random.default_rng(5).normal(size=32).astype(np.float32)
     similar(store, vector=query, space=SPACE, k=1)
-    (kept,) = (tmp_path / "cache" / "cells").iterdir()
+    (kept,) = (tmp_path / "cache" / "vectors").glob("*.faiss")
     first = kept.read_bytes()
 
     def answers() -> list[int]:
         with Store.open(store.path) as again:
             return [m.instance.id for m in similar(again, vector=query, space=SPACE, k=9, structure=True, state="any")]
 
-    assert answers() == brute(store, query, 9)
-    assert kept.read_bytes() == first, "nothing new, nothing kept anew"
-    with store.transaction():
-        store.embeddings.put(SPACE, [7, 8], np.stack([query, -query]))
-    assert answers()[0] == 7 and answers() == brute(store, query, 9)
-    for spoiled in (b"", first[:-100], first[: len(first) // 2] + bytes([1, 2, 3]) + first[len(first) // 2 + 3 :]):
+    with pytest.MonkeyPatch.context() as unread:
+        unread.setattr(vectors, "_filled", None)
+        assert answers() == brute(store, query, 9)
+        with store.transaction():
+            store.embeddings.put(SPACE, [7, 8], np.stack([query, -query]))
+            store.instances.drop(brute(store, query, 3)[2], None)
+        assert answers()[0] == 7 and answers() == brute(store, query, 9)
+        assert kept.read_bytes() == first, "little is new, nothing is kept anew"
+    for spoiled in (b"", first[: len(first) // 2]):
         kept.write_bytes(spoiled)
         assert answers() == brute(store, query, 9), "what is kept cannot change an answer"
 
 
-@pytest.fixture
-def opened_large(store: Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A memory that is read part by part and whose cells are kept, closed."""
-    monkeypatch.setattr(vectors, "_EXACT", 50)
-    monkeypatch.setattr(vectors, "_PROBED", 2)
-    monkeypatch.setattr(vectors, "_LOOKED_AT", 2)
-    monkeypatch.setattr(vectors, "_RANKED", 4)
-    monkeypatch.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
-    monkeypatch.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
-    monkeypatch.setenv("LIST3R_CACHE", str(tmp_path / "cache"))
-    similar(store, vector=np.ones(32), space=SPACE, k=1)
-    store.close()
-    return store.path
-
-
-def nearest_vector(path: Path, query: np.ndarray) -> int:
-    with Store.open(path) as store:
-        return similar(store, vector=query, space=SPACE, k=1, structure=True, state="any")[0].instance.id
-
-
-def test_a_memory_just_opened_reads_the_cells_that_are_asked_for(
-    opened_large: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_index_of_another_memory_of_its_name_is_not_asked(
+    store: Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    read: set[int] = set()
-    of = Embeddings.of
-
-    def noted(table: Embeddings, space: str, ids: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        read.update(ids)
-        return of(table, space, ids)
-
-    with Store.open(opened_large) as again:
-        rows = dict(zip(*again.embeddings.all(SPACE), strict=True))
-    monkeypatch.setattr(Embeddings, "of", noted)
-    for n in (3, 77, 201):
-        assert nearest_vector(opened_large, rows[n]) == n
-    assert 0 < len(read) < COUNT / 3
-
-
-@pytest.mark.parametrize("stored", ["another", "infinite", "shorter"])
-def test_a_vector_that_would_answer_is_checked_when_its_cell_is_read(opened_large: Path, stored: str) -> None:
-    with Store.open(opened_large) as again:
-        _, rows = again.embeddings.of(SPACE, [77])
-    vector = {"another": rows[0] + 1e-4, "infinite": rows[0] * np.inf, "shorter": rows[0, :-1]}[stored]
-    with contextlib.closing(sqlite3.connect(opened_large)) as database, database:
-        database.execute("UPDATE embeddings SET vector = ? WHERE instance = 77", (vector.astype("<f4").tobytes(),))
-        if stored != "another":
-            write_table(database, summed_tables()["embeddings"])
-    with pytest.raises(MemoryFileError):
-        nearest_vector(opened_large, rows[0])
+    monkeypatch.setattr(vectors, "_EXACT", 50)
+    monkeypatch.setenv("LIST3R_CACHE", str(tmp_path / "cache"))
+    query = np.random.default_rng(5).normal(size=32).astype(np.float32)
+    similar(store, vector=query, space=SPACE, k=1)
+    store.close()
+    store.path.unlink()
+    with Store.create(store.path) as other, other.transaction():
+        other.instances.put(boxes(np.random.default_rng(8)))
+        far = np.random.default_rng(9).normal(size=(COUNT, 32)).astype(np.float32)
+        other.embeddings.put(SPACE, range(1, COUNT + 1), far)
+    with Store.open(store.path) as other:
+        found = similar(other, vector=far[76], space=SPACE, k=1, structure=True, state="any")
+        assert found[0].instance.id == 77
 
 
-def test_checksums_that_leave_vectors_out_are_no_way_past_the_check(opened_large: Path) -> None:
-    with contextlib.closing(sqlite3.connect(opened_large)) as database, database:
-        database.execute("DELETE FROM sums WHERE name = 'embeddings' AND part = 4")
-    with pytest.raises(MemoryFileError, match="not as it was written"):
-        nearest_vector(opened_large, np.ones(32, np.float32))
+@pytest.mark.parametrize("shown", [False, True])
+def test_a_vector_that_would_answer_is_checked_as_it_is_read(
+    store: Store, shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vectors, "_EXACT", 50)
+    query = store.embeddings.of(SPACE, [77])[1][0]
+    similar(store, vector=query, space=SPACE, k=1)
+    store.close()
+    with contextlib.closing(sqlite3.connect(store.path)) as database, database:
+        database.execute("UPDATE embeddings SET vector = zeroblob(128) WHERE instance = 77")
+    with store_shown(store.path, lambda shown: None) if shown else Store.open(store.path) as opened:
+        for _ in range(2):
+            with pytest.raises(MemoryFileError, match="repair"):
+                similar(opened, vector=query, space=SPACE, k=1, structure=True, state="any")
 
 
 @pytest.mark.parametrize("exact", [100_000, 50])
@@ -274,12 +250,3 @@ def test_answers_do_not_outlive_transactions_that_were_taken_back(
             raise RuntimeError("no")
         assert [best()] == wanted
     store.close()
-
-
-def test_a_vector_of_a_memory_shown_otherwise_is_checked_too(opened_large: Path) -> None:
-    with contextlib.closing(sqlite3.connect(opened_large)) as database, database:
-        database.execute("UPDATE embeddings SET vector = zeroblob(128) WHERE instance = 77")
-    with store_shown(opened_large, lambda shown: None) as shown:
-        assert shown.embeddings.of(SPACE, [3])[0].tolist() == [3] and shown.embeddings.seals() == {}
-        with pytest.raises(MemoryFileError, match="embeddings 77"):
-            shown.embeddings.of(SPACE, [77])

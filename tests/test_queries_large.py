@@ -7,16 +7,13 @@ import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.records import Instance, Relation
-from list3r.memory.store.read_checks import unbelieved
 from list3r.memory.store.store import Store
-from list3r.memory.store.tables import words as word_table
 from list3r.queries.find import find
 from list3r.queries.match import Match
 from list3r.queries.nearest import nearest
@@ -69,7 +66,6 @@ def plain(matches: list[Match]) -> list[tuple[object, ...]]:
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(gather, "EVERYTHING", COUNT)
-    monkeypatch.setattr(word_table, "_FEW", COUNT // 5)
     return monkeypatch
 
 
@@ -203,8 +199,7 @@ DAMAGES = (
     "UPDATE instances SET structure = CASE WHEN structure IS NULL THEN 'wall' END WHERE id = ?",
     "UPDATE instances SET label = 'red box' WHERE id = ?",
     "UPDATE instances SET description = 'blue sheet' WHERE id = ?",
-    "UPDATE words SET weight = weight + 7 WHERE instance = ?",
-    "INSERT OR IGNORE INTO words SELECT 'red', ?, 999",
+    "UPDATE words_data SET block = CAST(block || x'00' AS BLOB) WHERE id > ?",
 )
 
 
@@ -213,12 +208,9 @@ def test_find_in_a_large_damaged_file_answers_as_in_a_sound_one_or_refuses(
     store: Store, damage: str, large: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     large.setattr(gather, "EVERYTHING", 0)
-    large.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
-    large.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
     texts = ("red box", "mug", "red", "wall")
     wanted = {text: plain(find(store, text)) for text in texts}
-    with contextlib.closing(sqlite3.connect(store.path)) as sound, sound:
-        pages = sound.serialize()
+    pages = store.connection._database.serialize("main")
     refused = 0
     for n in range(2, 62, 5):
         path = tmp_path / f"{n}.l3r"
@@ -233,20 +225,3 @@ def test_find_in_a_large_damaged_file_answers_as_in_a_sound_one_or_refuses(
                     assert "repair" in str(error)
                     refused += 1
     assert refused
-
-
-def test_rows_that_find_ranks_in_a_large_file_are_checked_once(store: Store, large: pytest.MonkeyPatch) -> None:
-    large.setattr(gather, "EVERYTHING", 0)
-    large.setattr("list3r.memory.store.connection.WHOLE_BYTES", 0)
-    large.setattr("list3r.memory.store.read_checks.MOST_ROWS", 0)
-    checked: list[int] = []
-
-    def count(*asked: Any) -> list[Any]:
-        checked.append(len(asked[2]))
-        return unbelieved(*asked)
-
-    large.setattr("list3r.memory.store.connection.unbelieved", count)
-    with Store.open(store.path) as again:
-        first, ranked = plain(find(again, "red box")), sum(checked)
-        checked.clear()
-        assert plain(find(again, "red box")) == first and sum(checked) == 5 < ranked

@@ -6,14 +6,16 @@ Runs without the other tests' helpers: `python -m pytest --noconftest tests/test
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-MEMORY = Path(__file__).parent / "fixtures" / "schema7.l3r"
+from list3r.memory.geometry import OrientedBox
+from list3r.memory.records import Instance, Relation
+from list3r.memory.store.store import Store
 
 
 def run(memory: Path, *words: str, before: str = "") -> subprocess.CompletedProcess[str]:
@@ -26,7 +28,18 @@ def run(memory: Path, *words: str, before: str = "") -> subprocess.CompletedProc
 
 @pytest.fixture
 def memory(tmp_path: Path) -> Path:
-    return Path(shutil.copy(MEMORY, tmp_path / "m.l3r"))
+    box = OrientedBox(np.zeros(3), np.ones(3), np.eye(3))
+    with Store.create(tmp_path / "m.l3r") as store, store.transaction():
+        store.facts.scale_kind, store.facts.gravity = "metric", "known"
+        store.instances.put(
+            Instance(
+                n, label, f"small red box, {n} cm", box.center, np.array([[-0.5] * 3, [0.5] * 3]), box, 0.9, 3,
+                0.0, 1.0, "present", None, (200, 30, 30), "red", 1, None,
+            )
+            for n, label in ((1, "mug"), (2, "table"))
+        )  # fmt: skip
+        store.relations.replace(None, [Relation(1, "on", 2, 0.9, 0.1)])
+    return tmp_path / "m.l3r"
 
 
 QUESTIONS = [

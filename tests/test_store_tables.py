@@ -1,8 +1,9 @@
-"""What tables hold as records: round trips, what older schemas kept elsewhere, and values that are none."""
+"""What tables hold as records: round trips, values that are none, and the views of other programs."""
 
 from __future__ import annotations
 
-import shutil
+import contextlib
+import sqlite3
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,35 +13,15 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.records import DetectedLabel, SessionCamera, Votes
+from list3r.memory.maintenance import edits
+from list3r.memory.records import ChangeEvent, DetectedLabel, Votes
 from list3r.memory.store.facts import Fact
+from list3r.memory.store.file import connected
 from list3r.memory.store.rows.json_values import array_scalar, typed
 from list3r.memory.store.store import Store
 
 Make = Callable[..., Path]
 CUP = Votes(0.5, {"cup": (4.0, 16.0)}, 4.0)
-
-
-def test_what_schema_7_kept_as_key_and_value_is_in_columns(tmp_path: Path) -> None:
-    path = Path(shutil.copy(Path(__file__).parent / "fixtures" / "schema7.l3r", tmp_path / "old.l3r"))
-    with Store.open(path, writable=True) as store:
-        first, second = store.sessions.all()
-        camera = SessionCamera((80.5, 80.25, 48.0, 36.0), (0.01, -0.02, 0.0, 0.0, 0.0), ("the camera was estimated",))
-        assert (first.camera, first.cuts, first.depth_step, first.lost_reasons) == (camera, (), 2, ())
-        assert (second.camera, second.cuts, second.depth_step) == (None, (7,), 1)
-        assert second.lost_reasons == ("too few matches",)
-        assert store.votes.of(1) == store.votes.of(2) == {"old-net": {0: CUP}}
-        assert store.detected_labels.all() == {1: DetectedLabel("cup", 0.9566, 8.0, "old-net")}
-        keys = {key for (key,) in store.connection.rows("SELECT key FROM memory")}
-        assert keys <= {
-            "created_by",
-            "gravity",
-            "label classes",
-            "last_id",
-            "poses",
-            "scale_source",
-        }
-        assert store.verify() == []
 
 
 def test_a_session_is_written_anew_as_it_is_said(make_memory: Make) -> None:
@@ -96,22 +77,49 @@ def test_a_fact_is_what_was_written_last_and_none_forgets_it(make_memory: Make) 
 
 
 @pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE frames SET time_s = 'soon' WHERE frame_index = 3",
+        "UPDATE instances SET label = x'00' WHERE id = 4",
+        "UPDATE instances SET geometry = x'00' WHERE id = 4",
+        "UPDATE instances SET confidence = 7 WHERE id = 4",
+        "UPDATE placements SET S_world_chunk = x'0000'",
+        "UPDATE supports SET points = x'00' WHERE local_id = 2",
+        "UPDATE sessions SET state = 'well'",
+    ],
+)
+def test_what_a_table_may_not_hold_is_not_written(make_memory: Make, statement: str) -> None:
+    with Store.open(make_memory(), writable=True) as store:
+        with pytest.raises(MemoryFileError, match=r"none of its table .*nothing was changed"), store.transaction():
+            store.connection.execute(statement)
+        assert store.verify() == []
+
+
+@pytest.mark.parametrize(
+    ("statement", "told"),
+    [
+        ("UPDATE instances SET confidence = 7 WHERE id = 4", "CHECK constraint failed in instances"),
+        ("UPDATE relations SET object = 77 WHERE subject = 3", "relations: a row points to one of instances"),
+        ("DELETE FROM placements", "chunks: a row points to one of placements"),
+    ],
+)
+def test_what_others_wrote_with_sums_of_their_own_is_named(make_memory: Make, statement: str, told: str) -> None:
+    path = make_memory()
+    with contextlib.closing(connected(path, "rw")) as database:
+        for setting in ("journal_mode=WAL", "ignore_check_constraints=ON"):
+            database.execute(f"PRAGMA {setting}").fetchall()
+        database.begin("IMMEDIATE")
+        database.execute(statement)
+        database.commit()
+    with Store.open(path) as store:
+        assert any(told in text for text in store.verify())
+
+
+@pytest.mark.parametrize(
     ("statement", "ask", "where"),
     [
-        (
-            "UPDATE frames SET time_s = 'soon' WHERE frame_index = 3",
-            lambda s: s.frames.all(),
-            "frames 1:3: time_s .*str",
-        ),
-        ("UPDATE instances SET label = x'00' WHERE id = 4", lambda s: s.instances.all(), "instances 4: label .*bytes"),
-        ("UPDATE instances SET geometry = x'00' WHERE id = 4", lambda s: s.instances.get(4), "instances 4: geometry"),
         ("UPDATE sessions SET settings = '[]'", lambda s: s.sessions.all(), "sessions 1: settings .*list"),
-        ("UPDATE placements SET S_world_chunk = x'0000'", lambda s: s.chunks.all(), "chunks 1: S_world_chunk"),
-        (
-            "UPDATE local_instances SET track = x'0000'",
-            lambda s: s.local_instances.nodes(),
-            "s 1:0: track",
-        ),
+        ("UPDATE local_instances SET track = x'0000'", lambda s: s.local_instances.nodes(), "s 1:0: track"),
     ],
 )
 def test_a_value_that_is_none_of_its_column_names_the_row(
@@ -123,6 +131,27 @@ def test_a_value_that_is_none_of_its_column_names_the_row(
         store.connection.forget()
         with pytest.raises(MemoryFileError, match=where):
             ask(store)
+
+
+def test_the_views_are_read_by_any_program(make_memory: Make) -> None:
+    path = make_memory()
+    with Store.open(path, writable=True) as store:
+        edits.label(store, 3, "mug")
+        mug, box = store.instances.get(3), store.instances.get(2).box
+        with store.transaction():
+            store.events.replace([ChangeEvent(1, 3, "moved", box, mug.box, (), 0.9, "it is elsewhere")])
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        row = database.execute(
+            "SELECT name, center_x, center_y, center_z, size_x, size_y, size_z, first_seen_s FROM things WHERE id = 3"
+        ).fetchone()
+        assert row == ("mug", *mug.center, *mug.box.size, mug.first_seen_s)
+        named = database.execute("SELECT subject_name, predicate, object FROM relations_named WHERE subject = 3")
+        assert ("mug", "on", 2) in named.fetchall()
+        event = database.execute("SELECT name, kind, from_x, to_x, source FROM events_named").fetchall()
+        assert event == [("mug", "moved", box.center[0], mug.box.center[0], "walk")]
+        ids = {n for (n,) in database.execute("SELECT id FROM things")}
+    with Store.open(path) as store:
+        assert ids == {i.id for i in store.instances.all(structure=False)}
 
 
 def test_arrays_are_known_by_their_type_in_every_numpy() -> None:

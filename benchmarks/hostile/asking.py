@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import signal
-import sqlite3
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -19,17 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from machine import end_with_parent
-from PIL import Image
 
 from list3r.cli.app import run
-from list3r.exporters.components import Component
-from list3r.exporters.plan import picture
-from list3r.exporters.plan.layout import PlanSettings
+from list3r.exporters.plan import drawing
 from list3r.exporters.registry import FORMATS
 from list3r.exporters.simready import thumbnail
-from list3r.memory.store import read_checks, store
-from list3r.memory.store.read_checks import ReadChecks
-from list3r.memory.store.store import Store
 
 LONGEST_S = 10.0
 """Processor time of a command; one that waits for something else than a processor for `WAITING_S` hangs too."""
@@ -129,76 +122,17 @@ def command_on(memory: Path, command: str, folder: Path) -> list[str]:
     return [*words[:place], str(memory), *words[place:]]
 
 
-def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> dict[str, frozenset[str]]:
-    """Run every command about a sound memory: all must answer. Return the tables that each has read of it.
-
-    Makes those that follow as fast as they can be.
-    """
-    picture.PlanSettings = functools.partial(  # type: ignore[assignment, misc]
-        PlanSettings, width_px=400, legend_px=4, min_map_px=50, max_map_px=100
-    )
+def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> None:
+    """Run every command about a sound memory: all must answer. Makes those that follow as fast as they can be."""
+    drawing.PlanSettings = functools.partial(drawing.PlanSettings, width_px=700, max_map_px=100)  # type: ignore[assignment, misc]
     thumbnail._SIDE_PX = 16
-    read: dict[str, frozenset[str]] = {}
     for command in commands:
-        with _tables_read() as tables:
-            ended = ask(command_on(memory, command, folder))
+        ended = ask(command_on(memory, command, folder))
         if ended.ended != "0":
             raise SystemExit(f"`{command}` about a sound memory ended with {ended}")
-        read[command] = frozenset(tables)
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
-    return read
-
-
-@contextlib.contextmanager
-def checked_once() -> Iterator[None]:
-    """Inside, each table is looked through once and a plan drawn once: for many commands that read one file."""
-    known: dict[str, tuple[list[str], Exception | None]] = {}
-    plans: dict[str, Image.Image] = {}
-    look, draw = read_checks.damage_of, picture.plan_image
-
-    def remembered(database: sqlite3.Connection, name: str, *, pages: bool = True) -> Iterator[str]:
-        if name not in known:
-            try:
-                known[name] = (list(look(database, name, pages=pages)), None)
-            except read_checks.FAILURES as error:
-                known[name] = ([], error)
-        found, failure = known[name]
-        yield from found
-        if failure is not None:
-            raise failure
-
-    def drawn(memory: Store, component: Component, how: PlanSettings | None = None) -> Image.Image:
-        if component.name not in plans:
-            plans[component.name] = draw(memory, component, how)
-        return plans[component.name]
-
-    read_checks.damage_of = store.damage_of = remembered
-    picture.plan_image = drawn
-    try:
-        yield
-    finally:
-        read_checks.damage_of = store.damage_of = look
-        picture.plan_image = draw
-
-
-@contextlib.contextmanager
-def _tables_read() -> Iterator[set[str]]:
-    """Names of the tables that connections made inside read."""
-    tables: set[str] = set()
-    note = ReadChecks._note
-
-    def also(self: ReadChecks, action: int, table: str | None, *more: str | None) -> int:
-        if action == sqlite3.SQLITE_READ and table is not None:
-            tables.add("instance_boxes" if table.startswith("instance_boxes") else table)
-        return note(self, action, table, *more)
-
-    ReadChecks._note = also  # type: ignore[method-assign]
-    try:
-        yield tables
-    finally:
-        ReadChecks._note = note  # type: ignore[method-assign]
 
 
 def peak_mb() -> int:

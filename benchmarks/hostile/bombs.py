@@ -6,10 +6,10 @@ Every bomb is met by a process of its own; processor time and the peak of its me
 from __future__ import annotations
 
 import bz2
+import contextlib
 import io
 import json
 import os
-import sqlite3
 import struct
 import subprocess
 import sys
@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from hostile.lies import sign
 from hostile.packed import jpeg, mp4, png, zipped
 from hostile.subject import write_source, write_subject
+from list3r.memory.store.file import connected
 from list3r.memory.store.rows.codec import pack
 
 MOST_S, MOST_MB = 2.0, 500
@@ -203,10 +203,13 @@ def _manifest(here: Path) -> list[str]:
 
 def _memory(here: Path, *statements: tuple[str, tuple[Any, ...]], command: str = "list", more: str = "") -> list[str]:
     path = write_subject(here / "m.l3r")
-    with sqlite3.connect(path) as database:
+    with contextlib.closing(connected(path, "rw")) as database:
+        for statement in ("journal_mode=WAL", "ignore_check_constraints=ON"):
+            database.execute(f"PRAGMA {statement}").fetchall()
+        database.begin("IMMEDIATE")
         for sql, arguments in statements:
             database.execute(sql, arguments)
-        sign(database)
+        database.commit()
     return [*command.split(), str(path), *more.split()]
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import apsw
+
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.store.facts import Fact
-from list3r.memory.store.file import file_hash
+from list3r.memory.store.file import connected, file_hash, fold_in
 from list3r.memory.store.store import Store
 
 BATCH_KEYS = Fact[tuple[str, ...]]("batch_keys", tuple[str, ...], ())
@@ -32,12 +33,14 @@ def seal(memory: Path, sealed: Path, keys: Sequence[str], source: str) -> str:
     part = sealed.with_name(f"{sealed.name}.part")
     part.unlink(missing_ok=True)
     try:
-        with contextlib.closing(sqlite3.connect(memory)) as database:
+        with contextlib.closing(connected(memory, "ro")) as database:
             database.execute("VACUUM INTO ?", (str(part),))
-        with contextlib.closing(sqlite3.connect(part, isolation_level=None)) as database:
-            database.execute("PRAGMA secure_delete=ON").fetchall()
-            database.execute("DELETE FROM log_mark")  # a number that is another one each time
-    except sqlite3.Error as error:
+        with contextlib.closing(connected(part, "rw")) as database:
+            for setting in ("journal_mode=WAL", "secure_delete=ON"):
+                database.execute(f"PRAGMA {setting}").fetchall()
+            database.sum_again()
+            fold_in(database, 0)
+    except apsw.Error as error:
         part.unlink(missing_ok=True)
         raise MemoryFileError(f"{sealed} cannot be written: {error}") from error
     part.replace(sealed)

@@ -28,7 +28,7 @@ from list3r.catalog.records import (
     Wanted,
 )
 from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError, naming_extras
-from list3r.memory.search.inverted_file import unit_query
+from list3r.memory.search.vectors import unit_query
 from list3r.queries.finding.grammar import Phrase, parse
 from list3r.queries.finding.words import STRUCTURE, wanted_words
 from list3r.queries.match import checked_count, checked_length, checked_point

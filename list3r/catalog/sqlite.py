@@ -24,7 +24,7 @@ from list3r.catalog.records import (
     Wanted,
 )
 from list3r.memory.geometry import OrientedBox
-from list3r.memory.search.inverted_file import unit
+from list3r.memory.search.vectors import unit
 
 _APPLICATION_ID = 0x4C334331
 """ASCII "L3C1"."""

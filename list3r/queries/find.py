@@ -92,7 +92,6 @@ def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
     scores = np.array([total[n] for n in ranks.ids.tolist()]) / (100 * len(words))
     order = np.lexsort((ranks.ids, -ranks.confidence, -scores))[:k]
     best = store.instances.of(ranks.ids[order].tolist())
-    store.words.check(best, words, total)
     score = dict(zip(ranks.ids[order].tolist(), scores[order].tolist(), strict=True))
     matches = [Match(i, round(score[i.id], 4), None, None, f"named {' '.join(words)}") for i in best]
     equal = int((scores > scores.max() - _EQUAL).sum())

@@ -50,13 +50,13 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
 
 def _is_broken(memory: Path, error: Exception) -> bool:
     """Whether a file that cannot be opened is an SQLite file with broken pages, and not some other file."""
-    import sqlite3
+    import apsw
 
     from list3r.exporters.output import is_database
+    from list3r.memory.store.pages import PageDamaged
 
     cause = error.__cause__
-    broken = isinstance(cause, sqlite3.DatabaseError) and not isinstance(cause, sqlite3.OperationalError)
-    return broken and is_database(memory)
+    return isinstance(cause, apsw.CorruptError | apsw.NotADBError | PageDamaged) and is_database(memory)
 
 
 def repair(

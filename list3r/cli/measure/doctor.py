@@ -6,9 +6,10 @@ import ctypes.util
 import os
 import platform
 import shutil
-import sqlite3
 import tempfile
 from importlib import metadata
+
+import apsw
 
 from list3r.memory.errors import first_line
 from list3r.models.cache import cache_folder, find_cached
@@ -17,6 +18,7 @@ from list3r.models.device import find_gpu
 from list3r.models.presets import missing_package
 
 _PACKAGES = (
+    ("apsw", "everything"),
     ("numpy", "everything"),
     ("scipy", "everything"),
     ("opencv-python-headless", "reading frames, features"),
@@ -41,7 +43,7 @@ _PACKAGES = (
     ("rerun-sdk", "export --to rerun"),
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
-_NEEDED = {"numpy", "scipy", "networkx", "faiss-cpu", "typer", "rich"}
+_NEEDED = {"apsw", "numpy", "scipy", "networkx", "faiss-cpu", "typer", "rich"}
 """What asking a memory takes; the others come with extras, which a command that lacks one names."""
 _LIBRARIES = (
     ("GL", "Open3D only (apt-get install libgl1 libegl1)"),
@@ -119,10 +121,6 @@ def _package(name: str, use: str) -> tuple[str, str, str]:
 
 
 def _sqlite() -> tuple[str, str, str]:
-    database = sqlite3.connect(":memory:")
-    options = {row[0] for row in database.execute("PRAGMA compile_options")}
-    database.close()
-    state = (
-        sqlite3.sqlite_version if "ENABLE_RTREE" in options else f"MISSING: R*Tree in SQLite {sqlite3.sqlite_version}"
-    )
+    missing = {"ENABLE_RTREE", "ENABLE_FTS5"} - set(apsw.compile_options)
+    state = f"MISSING: {', '.join(sorted(missing))}" if missing else apsw.sqlite_lib_version()
     return "sqlite", state, "the memory file"

@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 
-VERSION = 1
-"""Goes up with every change of what words an instance has: the index of words in a file is then made again."""
-
 _SYNONYMS = {
     "ground": "floor",
     "gray": "grey",

@@ -32,7 +32,7 @@ class Redundant:
 
 
 def find_redundant(scene: Scene) -> Redundant:
-    """Go through the chunks in order. What moves is never redundant, nor what an operator spoke of."""
+    """Go through the chunks in order. What moves is not redundant, nor what an operator parted from what it is like."""
     settings, like, whole = scene.settings.redundancy, dict[Key, Key](), set[int]()
     if settings.chunks == 0:
         return Redundant({}, frozenset())
@@ -42,7 +42,7 @@ def find_redundant(scene: Scene) -> Redundant:
         if len(earlier) < settings.chunks:
             continue
         shapes = scene.shapes(k)
-        spared = [(k, n) in scene.motions or scene.constraints.speaks_of((k, n)) for n in shapes.local_id.tolist()]
+        spared = [(k, n) in scene.motions for n in shapes.local_id.tolist()]
         empty = np.bincount(shapes.owner, minlength=len(spared)) == 0
         times, met = np.where(spared, -len(earlier), settings.chunks * empty), dict[int, PairScores]()
         for left, u in zip(range(len(earlier), 0, -1), reversed(earlier), strict=True):
@@ -55,10 +55,17 @@ def find_redundant(scene: Scene) -> Redundant:
             times += share >= settings.covered
         found = np.flatnonzero(times >= settings.chunks)
         best = _most_like(scene, k, found, met)
-        like |= {(k, n): best.get(n, (k, n)) for n in shapes.local_id[found].tolist()}
-        if len(found) == len(times):
+        fresh = {(k, n): best.get(n, (k, n)) for n in shapes.local_id[found].tolist()}
+        fresh = {key: other for key, other in fresh.items() if not _parted(scene, key, other)}
+        like |= fresh
+        if len(fresh) == len(times):
             whole.add(k)
     return Redundant(like, frozenset(whole))
+
+
+def _parted(scene: Scene, key: Key, like: Key) -> bool:
+    """Return whether an operator parted a local instance from what it is like, or spoke of one that is like nothing."""
+    return scene.constraints.links.forbids(key, like) or (key == like and scene.constraints.speaks_of(key))
 
 
 def _most_like(scene: Scene, k: int, wanted: Ints, met: Mapping[int, PairScores]) -> dict[int, Key]:

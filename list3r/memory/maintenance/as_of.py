@@ -56,7 +56,6 @@ def _show(past: Store, session_id: int, instances: Sequence[Instance]) -> None:
     views["edges"] = f"u IN {chunks} AND v IN {chunks}"
     views["observations"] = f"chunk_id IN {chunks} AND instance IN {ids}"
     views["embeddings"] = views["detected_labels"] = f"instance IN {ids}"
-    views["words"] = f"word = '' OR instance IN {ids}"
     with past.connection.temporary():
         for table, condition in views.items():
             past.connection.execute(f"CREATE TEMP VIEW {table} AS SELECT * FROM main.{table} WHERE {condition}")

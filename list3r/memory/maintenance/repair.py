@@ -1,47 +1,34 @@
-"""A damaged memory to a sound one: every row that is as it was written is kept, the rest is derived again or named."""
+"""A damaged memory to a sound one: every row on sound pages is kept, the rest is derived again or named."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
-import sqlite3
 import tempfile
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+import apsw
 
 from list3r.memory.errors import MemoryFileError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
 from list3r.memory.records import Session
 from list3r.memory.store.beside import put_foreign_log_aside
-from list3r.memory.store.checksums import (
-    OWN_CRC,
-    SUMS_SINCE,
-    SummedTable,
-    bad_rows,
-    row_crc,
-    stored_sums,
-    summed_tables,
-    write_table,
-)
+from list3r.memory.store.database import FAILURES, Database
 from list3r.memory.store.file import (
     check_beside,
     check_numbers,
     check_schema,
     connected,
     fold_in,
-    migrate,
     numbers,
-    protect,
     rename_exclusively,
 )
 from list3r.memory.store.lock import WriterLock
-from list3r.memory.store.read_checks import FAILURES, GEOMETRY_BYTES
-from list3r.memory.store.rows.codec import checksum, unpack
-from list3r.memory.store.rows.values import bad_values
-from list3r.memory.store.schema import SCHEMA_VERSION
+from list3r.memory.store.rows.codec import unpack
+from list3r.memory.store.schema import SCHEMA_VERSION, tables
 from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
@@ -51,6 +38,9 @@ _PASSING = ("pair_scores",)
 _OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""
+_LAST = 2**31
+_PROBES = 5000
+"""Ranges of a table that are looked for rows, at most, where its pages are damaged."""
 
 Row = tuple[Any, ...]
 
@@ -110,7 +100,7 @@ def _repair(path: Path, target: Path) -> RepairReport:
             _fold_in_log(path)
             return _report(path, path, (), _Lost(), rebuilt=False)
         lost = _Lost()
-        with contextlib.closing(_connect(path, copy, lost)) as damaged, Store.create(made) as store:
+        with contextlib.closing(_connect(path, copy)) as damaged, Store.create(made) as store:
             _salvage(damaged, store, lost)
             rebuilt = bool(damage) and _needs_deriving(lost)
             if rebuilt:
@@ -165,53 +155,36 @@ def _damage(copy: Path) -> list[str]:
         return [str(error).replace(str(copy), "the file")]
 
 
-def _connect(path: Path, copy: Path, lost: _Lost) -> sqlite3.Connection:
+def _connect(path: Path, copy: Path) -> Database:
     """Return the damaged file as SQLite sees it; its schema must be ours, the rest need not.
 
-    Of a file of an older schema what is not as it was written is left out, and the rest is brought forward.
+    Where the sums of pages are damaged themselves, pages are taken as they are.
     """
-    database = sqlite3.connect(copy, isolation_level=None)
+    try:
+        database = connected(copy, "rw")
+    except FAILURES as error:
+        raise MemoryFileError(f"{path} cannot be repaired: {error}; use a backup") from error
     try:
         _check_ours(path, database)
-    except MemoryFileError:
-        database.close()
-        raise
-    try:
-        protect(database)
-        database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
-        version = int(database.execute("PRAGMA user_version").fetchone()[0])
-        if SUMS_SINCE <= version < SCHEMA_VERSION:
-            check_schema(path, database, version)
-            _drop_bad_rows(database, version, lost)
-            migrate(database, version)
         check_schema(path, database, SCHEMA_VERSION)
-    except (*FAILURES, MemoryFileError) as error:
+        try:
+            database.begin()
+        except FAILURES:
+            database.trust()
+        return database
+    except MemoryFileError as error:
+        database.close()
+        if error.__cause__ is None and "newer" in str(error):
+            raise
+        raise MemoryFileError(f"{path} cannot be repaired ({error}); use a backup") from error
+    except FAILURES as error:
         database.close()
         raise MemoryFileError(
             f"{path} cannot be repaired: its table of contents is damaged ({error}); use a backup"
         ) from error
-    return database
 
 
-def _drop_bad_rows(database: sqlite3.Connection, version: int, lost: _Lost) -> None:
-    """Take rows out of a file of an older schema that are not as they were written, and all that was said of those."""
-    tables = summed_tables(version)
-    for bad in list(bad_rows(database, version)):
-        table = tables.get(bad.table)
-        if table is not None and bad.key is not None:
-            lost.add(bad.table, bad.key)
-            where = " AND ".join(f"{c} IS ?" for c in table.key)
-            database.execute(f"DELETE FROM {bad.table} WHERE {where}", bad.key)
-        elif table is not None:
-            lost.unnamed[bad.table] = lost.unnamed.get(bad.table, 0) + 1
-    for name, table in tables.items():
-        write_table(database, table)
-        database.execute(
-            f"DELETE FROM sums WHERE name = ? AND part NOT IN (SELECT {table.part_of(name)} FROM {name})", (name,)
-        )
-
-
-def _check_ours(path: Path, database: sqlite3.Connection) -> None:
+def _check_ours(path: Path, database: Database) -> None:
     """Raise `MemoryFileError` for a file that can be read but belongs to another program or a newer version."""
     with contextlib.suppress(*FAILURES):
         check_numbers(path, *numbers(database))
@@ -222,10 +195,10 @@ def _check_ours(path: Path, database: sqlite3.Connection) -> None:
 
 @dataclass
 class _Lost:
-    """Keys of rows that could not be saved, by table; counts of those whose keys are unknown."""
+    """Keys of rows that could not be saved, by table; tables that lost others, whose keys are unknown."""
 
     keys: dict[str, dict[Row, None]] = field(default_factory=dict)
-    unnamed: dict[str, int] = field(default_factory=dict)
+    unnamed: set[str] = field(default_factory=set)
     instances: set[int] = field(default_factory=set)
     """Ids that the damaged file names."""
 
@@ -233,95 +206,85 @@ class _Lost:
         self.keys.setdefault(table, {})[key] = None
 
 
-def _salvage(damaged: sqlite3.Connection, store: Store, lost: _Lost) -> None:
-    """Write all rows that are as they were written, and what belongs to them, into an empty store."""
-    tables = {name: table for name, table in summed_tables().items() if name not in _PASSING}
-    kept = {name: _sound_rows(damaged, table, lost) for name, table in tables.items()}
-    lost.instances = {key[0] for key in (*kept["instances"], *lost.keys.get("instances", ()))}
+def _salvage(damaged: Database, store: Store, lost: _Lost) -> None:
+    """Write all rows on sound pages, and what belongs to them, into an empty store."""
+    kept = {name: _Rows(damaged, name, lost).kept for name in tables() if name not in _PASSING}
+    lost.instances = {key[0] for key in kept["instances"]} | {row[2] for row in kept["observations"].values()}
     _drop_unreadable(kept, lost)
     _drop_orphans(kept, lost)
     with store.transaction():
         for name, rows in kept.items():
-            table = summed_tables()[name]
-            marks = ",".join("?" * len(table.columns))
-            store.connection.execute_many(
-                f"INSERT INTO {name} ({', '.join(table.columns)}) VALUES ({marks})", list(rows.values())
-            )
-        store.instances.index_boxes()
+            columns = tables()[name][0]
+            statement = f"INSERT INTO {name} ({', '.join(columns)}) VALUES ({','.join('?' * len(columns))})"
+            for key, row in rows.items():
+                try:
+                    store.connection.execute(statement, row)
+                except apsw.ConstraintError:  # what no row may hold
+                    lost.add(name, key)
+        store.instances.index_again()
         _stand_in_for_lost(store, lost)
 
 
-def _sound_rows(damaged: sqlite3.Connection, table: SummedTable, lost: _Lost) -> dict[Row, Row]:
-    """Return rows of a table by key that match the checksums written of them."""
-    try:
-        sums, _ = stored_sums(damaged, table)
-    except FAILURES:
-        sums = {}
-    lies = _lies(damaged, table)
-    summed = [table.columns.index(c) for c in table.summed]
-    kept: dict[Row, Row] = {}
-    missing = {part: list(crcs) for part, crcs in sums.items()}
-    for part, key, row in _readable(damaged, table, sorted(sums)):
-        if key in kept:
-            continue
-        crc = row_crc(tuple(row[k] for k in summed))
-        known = missing.get(part)
-        if (known is not None and crc not in known) or not _own_crc_holds(table, row) or key in lies:
-            lost.add(table.name, key)
-            continue
-        if known is not None:
-            known.remove(crc)
-        kept[key] = row
-    gone = sum(map(len, missing.values())) - len(set(lost.keys.get(table.name, ())) - kept.keys())
-    if gone > 0:
-        lost.unnamed[table.name] = gone
-    return kept
+class _Rows:
+    """Rows of a table that can still be read: from both ends, and, between pages that are damaged, by halves."""
 
+    def __init__(self, damaged: Database, name: str, lost: _Lost) -> None:
+        self._damaged, self._name, self._lost = damaged, name, lost
+        self._columns, self._key = tables()[name]
+        self._at = [self._columns.index(column) for column in self._key]
+        self._probes = _PROBES
+        self.kept: dict[Row, Row] = {}
+        if not self._read("1", ()) and not self._read_by_number(()):
+            lost.unnamed.add(name)
 
-def _lies(damaged: sqlite3.Connection, table: SummedTable) -> set[Row]:
-    """Keys of rows that hold what none may hold, whatever their checksums say."""
-    try:
-        return {bad.key for bad in bad_values(damaged, table.name) if bad.key is not None}
-    except FAILURES:
-        return set()
+    def _read(self, where: str, arguments: Row) -> bool:
+        """Read what meets a condition, from both ends; whether that is all of it."""
+        self._probes -= 1
+        for order in ("ASC", "DESC"):
+            ordered = ", ".join(f"{column} {order}" for column in self._key)
+            query = f"SELECT {', '.join(self._columns)} FROM {self._name} WHERE {where} ORDER BY {ordered}"
+            try:
+                for row in self._damaged.execute(query, arguments):
+                    self.kept.setdefault(tuple(row[k] for k in self._at), row)
+                return True
+            except FAILURES:
+                pass
+        return False
 
+    def _read_by_number(self, before: Row) -> bool:
+        """Read rows whose key begins with some values by halves of the next number; whether all could be named."""
+        if len(before) == len(self._key) or self._name == "memory":
+            return False
+        same = "".join(f"{column} = ? AND " for column in self._key[: len(before)])
+        column, waiting, named = self._key[len(before)], [(-1, _LAST)], True
+        while waiting and self._probes > 0:
+            low, high = waiting.pop()
+            if self._read(f"{same}{column} BETWEEN ? AND ?", (*before, low, high)):
+                continue
+            if low < high:
+                middle = (low + high) // 2
+                waiting += [(middle + 1, high), (low, middle)]
+            else:
+                named &= self._read_by_number((*before, low)) or self._name_lost((*before, low))
+        return named and not waiting
 
-def _readable(damaged: sqlite3.Connection, table: SummedTable, parts: list[int]) -> Iterator[tuple[int, Row, Row]]:
-    """Return (part, key, row) of all rows that SQLite can still reach: from both ends of the table, then part by
-    part.
-    """
-    keys = [table.columns.index(c) for c in table.key]
-    whole = True
-    select = f"SELECT {table.part_of(table.name)}, {', '.join(table.columns)} FROM {table.name}"
-    for order in ("ASC", "DESC"):
-        ordered = ", ".join(f"{c} {order}" for c in table.key)
-        whole = True
+    def _name_lost(self, before: Row) -> bool:
+        """Name rows whose keys can be read, and the rest cannot."""
+        same = " AND ".join(f"{column} = ?" for column in self._key[: len(before)])
         try:
-            for part, *row in damaged.execute(f"{select} ORDER BY {ordered}"):
-                yield part, tuple(row[k] for k in keys), tuple(row)
+            keys = self._damaged.execute(f"SELECT {', '.join(self._key)} FROM {self._name} WHERE {same}", before)
+            for key in keys.fetchall():
+                if key not in self.kept:
+                    self._lost.add(self._name, key)
+            return True
         except FAILURES:
-            whole = False
-        if whole:
-            return
-    for part in parts:
-        clause, arguments = table.where(range(part, part + 1))
-        with contextlib.suppress(*FAILURES):
-            for _, *row in damaged.execute(f"{select} WHERE {clause}", arguments):
-                yield part, tuple(row[k] for k in keys), tuple(row)
-
-
-def _own_crc_holds(table: SummedTable, row: Row) -> bool:
-    if table.name not in OWN_CRC:
-        return True
-    values = dict(zip(table.columns, row, strict=True))
-    blobs = [values[c] for c in OWN_CRC[table.name]]
-    return all(isinstance(b, bytes) for b in blobs) and checksum(*blobs) == values["crc"]
+            return False
 
 
 def _drop_unreadable(kept: dict[str, dict[Row, Row]], lost: _Lost) -> None:
-    """Rows without a checksum of theirs, whose sums were damaged, must at least be readable."""
+    """Rows whose arrays cannot be read are of no use."""
     for name, column in _BLOBS.items():
-        at = summed_tables()[name].columns.index(column)
+        at = tables()[name][0].index(column)
         for key, row in list(kept[name].items()):
             try:
                 unpack(row[at], name)
@@ -329,18 +292,12 @@ def _drop_unreadable(kept: dict[str, dict[Row, Row]], lost: _Lost) -> None:
                 lost.add(name, key)
                 del kept[name][key]
 
-    at = summed_tables()["instances"].columns.index("geometry")
-    for key, row in list(kept["instances"].items()):
-        if not isinstance(row[at], bytes) or len(row[at]) != GEOMETRY_BYTES:
-            lost.add("instances", key)
-            del kept["instances"][key]
-
 
 def _drop_orphans(kept: dict[str, dict[Row, Row]], lost: _Lost) -> None:
     """What hung on a row that is lost goes with it."""
 
     def column(name: str, row: Row, wanted: str) -> Any:
-        return row[summed_tables()[name].columns.index(wanted)]
+        return row[tables()[name][0].index(wanted)]
 
     def drop(name: str, gone: list[Row]) -> None:
         for key in gone:
@@ -355,16 +312,16 @@ def _drop_orphans(kept: dict[str, dict[Row, Row]], lost: _Lost) -> None:
         drop(name, [k for k, chunk in orphans.items() if chunk not in chunks])
     drop("edges", [k for k in kept["edges"] if k[0] not in chunks or k[1] not in chunks])
     pairs = kept["local_instances"].keys() & kept["supports"].keys()
-    for name in ("local_instances", "supports"):
-        drop(name, [k for k in kept[name] if k not in pairs])
+    for name, other in (("local_instances", "supports"), ("supports", "local_instances")):
+        for key in [k for k in kept[name] if k not in pairs]:
+            lost.add(other, key)
+            del kept[name][key]
     drop("observations", [k for k in kept["observations"] if k not in pairs])
 
 
 def _name_missing(lost: _Lost, table: str, key: Row) -> None:
     """A row that is missing, whose key something else still tells."""
-    if key not in lost.keys.get(table, {}):
-        lost.add(table, key)
-        lost.unnamed[table] = max(0, lost.unnamed.get(table, 0) - 1)
+    lost.add(table, key)
 
 
 def _stand_in_for_lost(store: Store, lost: _Lost) -> None:
@@ -437,9 +394,9 @@ def _report(target: Path, original: Path, damage: tuple[str, ...], lost: _Lost, 
         for table, keys in lost.keys.items()
         if keys and not (rebuilt and table in _DERIVED)
     }
-    for table, count in lost.unnamed.items():
-        if count > 0 and not (rebuilt and table in _DERIVED):
-            names.setdefault(table, []).append(f"{count} more")
+    for table in sorted(lost.unnamed):
+        if not (rebuilt and table in _DERIVED) and table not in names:
+            names[table] = ["rows on damaged pages"]
     with Store.open(target) as store:
         ids = {i.id for i in store.instances.all()}
         chunks = len(store.chunks.all())

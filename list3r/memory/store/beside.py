@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sqlite3
 import time
 import warnings
 from pathlib import Path
 
+import apsw
+
 from list3r.memory.errors import MemoryFileError, MemoryFileWarning
+from list3r.memory.store.database import Database
 from list3r.memory.store.file import connected, identified, private_copy, reader, rename_exclusively
 from list3r.memory.store.log_mark import Log, Mark, mark_of_file
 
@@ -20,10 +22,10 @@ _PAUSE_S = 0.02
 _LEFT = "left by a writer that was killed before this file took the name"
 
 
-def opened_to_read(path: Path) -> sqlite3.Connection:
+def opened_to_read(path: Path) -> Database:
     """A connection for reading: see `reader`. The log of another file is left out, with a `MemoryFileWarning`.
 
-    Raises `MemoryFileError` or `sqlite3.Error` for a file that is cut off.
+    Raises `MemoryFileError` or `apsw.Error` for a file that is cut off.
     """
     log, own = _log_beside(path)
     if log is not None and not own:
@@ -42,7 +44,7 @@ def take_up_log(path: Path) -> None:
     """See to it that a file that is about to be written has no log beside it but its own.
 
     For the holder of the lock. A log of another file gets another name, with a `MemoryFileWarning`. Raises
-    `MemoryFileError` or `sqlite3.Error` for a file that cannot be opened; nothing is changed then.
+    `MemoryFileError` or `apsw.Error` for a file that cannot be opened; nothing is changed then.
     """
     log, own = _log_beside(path)
     if log is not None and own:
@@ -61,7 +63,7 @@ def put_foreign_log_aside(path: Path) -> None:
         _put_aside(path)
 
 
-def not_alone(path: Path, database: sqlite3.Connection) -> str | None:
+def not_alone(path: Path, database: Database) -> str | None:
     """One sentence where a file lacks what was written last, which lies in the log beside it or did; None where not."""
     log = _log_path(path.resolve())
     size = log.stat().st_size if log.exists() else 0
@@ -72,7 +74,7 @@ def not_alone(path: Path, database: sqlite3.Connection) -> str | None:
             f"what was written last lies in {log.name} ({size / 1e6:.2f} MB): a copy needs both files; "
             f"`list3r repair {path}` folds it in when nobody writes"
         )
-    copied = database.execute("PRAGMA journal_mode").fetchone()[0] == "off"
+    copied = database.execute("PRAGMA journal_mode").fetchall()[0][0] == "off"
     return f"it was copied while {log.name} was beside it; what was written last may be missing" if copied else None
 
 
@@ -112,12 +114,12 @@ def _mark(path: Path) -> Mark | None:
     try:
         with contextlib.closing(connected(path, "file", whole=False)) as alone:
             return mark_of_file(alone)
-    except sqlite3.Error:
+    except apsw.Error:
         return None
 
 
 def _check_alone(path: Path) -> None:
-    """Raise `MemoryFileError` or `sqlite3.Error` for a file that is no whole memory without its log."""
+    """Raise `MemoryFileError` or `apsw.Error` for a file that is no whole memory without its log."""
     with contextlib.closing(connected(path, "file")) as database:
         identified(path, database)
 
@@ -131,8 +133,8 @@ def _check_complete(path: Path, log: Log) -> None:
         return
     try:
         with contextlib.closing(private_copy(path)) as copy:
-            found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
-    except sqlite3.Error as error:
+            found = copy.execute("PRAGMA quick_check(1)").fetchall()[0][0]
+    except apsw.Error as error:
         found = str(error)
     if found != "ok":
         raise MemoryFileError(

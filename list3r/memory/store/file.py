@@ -6,19 +6,19 @@ import contextlib
 import hashlib
 import os
 import shutil
-import sqlite3
 import stat
 import tempfile
 import time
 from pathlib import Path
-from urllib.parse import quote
+
+import apsw
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.checksums import SUMS_SINCE, bad_rows, write_all
+from list3r.memory.store.database import Database
 from list3r.memory.store.log_mark import LOG_STARTS, begin_marking
+from list3r.memory.store.pages import PageDamaged, schema_of
 from list3r.memory.store.rows.codec import MAX_BLOB_BYTES
 from list3r.memory.store.schema import APPLICATION_ID, MIGRATIONS, SCHEMA_VERSION, expected_schema, read_schema
-from list3r.memory.store.word_index import write_words
 
 PAGE_BYTES = 16384
 """Pages of new files. A row of a clustered table stays in its page up to a quarter of it. Vectors of up to 1,000
@@ -38,14 +38,14 @@ _WAIT_S = 30.0
 
 _SMALLEST = 512
 """Bytes of the smallest SQLite file."""
-_UNREADABLE_HERE = (
-    "SQLITE_READONLY_ROLLBACK",
-    "SQLITE_READONLY_RECOVERY",
-    "SQLITE_READONLY_CANTINIT",
-    "SQLITE_READONLY",
-    "SQLITE_CANTOPEN",
-    "SQLITE_IOERR_LOCK",
-)
+_UNREADABLE_HERE = {
+    apsw.SQLITE_READONLY_ROLLBACK,
+    apsw.SQLITE_READONLY_RECOVERY,
+    apsw.SQLITE_READONLY_CANTINIT,
+    apsw.SQLITE_READONLY,
+    apsw.SQLITE_CANTOPEN,
+    apsw.SQLITE_IOERR_LOCK,
+}
 """What SQLite says of a file that it could read only by writing."""
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 _BESIDE = {
@@ -56,8 +56,18 @@ _BESIDE = {
 """What SQLite writes beside a file, and how it begins."""
 
 
+def damaged(path: Path, found: str) -> str:
+    """Return what is said of a damaged file."""
+    return f"{path} is damaged ({found}); `list3r repair {path}` saves what is sound"
+
+
 def explained(path: Path, error: Exception) -> str:
+    """Return what is said where SQLite could not do something."""
     text = str(error)
+    if isinstance(error, PageDamaged):
+        return damaged(path, text)
+    if isinstance(error, apsw.ConstraintError):
+        return f"{path}: what was to be written is none of its table ({text}); nothing was changed"
     if "not a database" in text:
         return f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`"
     if "full" in text or "disk I/O" in text:
@@ -72,17 +82,20 @@ def explained(path: Path, error: Exception) -> str:
     return f"{path}: {text}; run `list3r verify {path}`, `list3r repair {path}` saves what is sound"
 
 
-def connected(path: Path, mode: str, *, alone: bool = False, whole: bool = True) -> sqlite3.Connection:
+def connected(path: Path, mode: str, *, alone: bool = False, whole: bool = True) -> Database:
     """A connection that runs nothing that the file brings along and holds no value larger than a blob may be.
 
     With `alone` it asks for the file for itself until it is told otherwise. The mode is one of SQLite, or `file`, in
     which only the file is read, as it is: no log or journal, and without a lock. Unless it is to be `whole`, a file
     that is shorter than it says is read as well.
     """
-    mode = "ro&immutable=1" if mode == "file" else mode
-    uri = f"file:{quote(os.fsencode(path.resolve()))}?mode={mode}"
-    database = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_WAIT_S, check_same_thread=False)
     try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        raise MemoryFileError(f"the path {path} is not valid UTF-8; rename it") from error
+    database = Database(path, mode)
+    try:
+        database.set_busy_timeout(round(1000 * _WAIT_S))
         if alone:
             database.execute("PRAGMA locking_mode=EXCLUSIVE").fetchall()
         if not whole:
@@ -94,14 +107,14 @@ def connected(path: Path, mode: str, *, alone: bool = False, whole: bool = True)
     return database
 
 
-def protect(database: sqlite3.Connection) -> None:
+def protect(database: Database) -> None:
     """Settings under which the file of a stranger may be read."""
-    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOB_BYTES + 2**20)
+    database.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_BLOB_BYTES + 2**20)
     for setting in ("trusted_schema=OFF", "cell_size_check=ON", "temp_store=MEMORY", f"cache_size=-{_CACHE_KIB}"):
-        database.execute(f"PRAGMA {setting}")
+        database.execute(f"PRAGMA {setting}").fetchall()
 
 
-def identified(path: Path, database: sqlite3.Connection) -> int:
+def identified(path: Path, database: Database) -> int:
     """The schema version of a memory. Raises `MemoryFileError` for what is none, is newer, or holds what none does."""
     application, version = numbers(database)
     if application != APPLICATION_ID and path.stat().st_size < _SMALLEST:
@@ -113,12 +126,13 @@ def identified(path: Path, database: sqlite3.Connection) -> int:
     return version
 
 
-def numbers(database: sqlite3.Connection) -> tuple[int, int]:
+def numbers(database: Database) -> tuple[int, int]:
     """Return the application id and the schema version of a file."""
     application, version = (
-        int(database.execute(f"PRAGMA {name}").fetchone()[0]) for name in ("application_id", "user_version")
+        int(database.execute(f"PRAGMA {name}").fetchall()[0][0])  # type: ignore[arg-type]
+        for name in ("application_id", "user_version")
     )
-    return application, version
+    return application, schema_of(version)
 
 
 def check_numbers(path: Path, application: int, version: int) -> None:
@@ -131,7 +145,7 @@ def check_numbers(path: Path, application: int, version: int) -> None:
         )
 
 
-def check_schema(path: Path, database: sqlite3.Connection, version: int) -> None:
+def check_schema(path: Path, database: Database, version: int) -> None:
     """Raise `MemoryFileError` when the file holds anything else than its schema: tables, triggers, views, indices."""
     expected, found = expected_schema(version), read_schema(database)
     for kind, name in sorted(found.keys() - expected.keys()):
@@ -154,9 +168,11 @@ def write_empty(path: Path) -> None:
         os.close(descriptor)
         database = connected(new, "rw")
         try:
-            database.execute(f"PRAGMA page_size = {PAGE_BYTES}")
-            database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            database.start(PAGE_BYTES)
+            for setting in ("journal_mode = WAL", f"application_id = {APPLICATION_ID}"):
+                database.execute(f"PRAGMA {setting}").fetchall()
             migrate(database, 0)
+            fold_in(database, 0)
         finally:
             database.close()
         rename_exclusively(new, path)
@@ -164,11 +180,11 @@ def write_empty(path: Path) -> None:
         raise MemoryFileError(taken(path)) from error
     except OSError as error:
         raise MemoryFileError(f"{path} cannot be created: {error.strerror}") from error
-    except sqlite3.Error as error:
+    except apsw.Error as error:
         raise MemoryFileError(explained(path, error)) from error
     finally:
-        if new is not None:
-            new.unlink(missing_ok=True)
+        for end in ("", "-wal", "-shm", "-journal") if new is not None else ():
+            Path(f"{new}{end}").unlink(missing_ok=True)
 
 
 def taken(path: Path) -> str:
@@ -196,7 +212,7 @@ def _umask() -> int:
     return mask
 
 
-def use_write_ahead_log(path: Path, database: sqlite3.Connection) -> None:
+def use_write_ahead_log(path: Path, database: Database) -> None:
     """Readers may hold the file for a moment as the journal changes; that is waited for.
 
     While SQLite waits it lets no new reader in, so that those who read without a pause do not keep a writer out; in
@@ -210,9 +226,7 @@ def use_write_ahead_log(path: Path, database: sqlite3.Connection) -> None:
             begin_marking(database)
             database.execute("PRAGMA journal_mode=WAL").fetchall()
             break
-        except sqlite3.OperationalError as error:
-            if "locked" not in str(error):
-                raise
+        except apsw.BusyError as error:
             if time.monotonic() > end:
                 raise MemoryFileError(
                     f"{path} is being read by {_readers(path.resolve())} and cannot be written until it is closed there"
@@ -237,23 +251,9 @@ def _readers(path: Path) -> str:
     return f"process {', '.join(map(str, sorted(held)))} (is it stopped?)" if held else "another process"
 
 
-def migrated_copy(path: Path, source: sqlite3.Connection) -> sqlite3.Connection:
-    """A copy of an older file in the present schema, in a nameless file of SQLite that ends with the connection."""
-    copy = sqlite3.connect("", isolation_level=None, check_same_thread=False)
-    try:
-        source.backup(copy)
-        protect(copy)
-        migrate(copy, identified(path, copy))
-    except BaseException:
-        copy.close()
-        raise
-    return copy
-
-
-def private_copy(path: Path, *, log: bool = True) -> sqlite3.Connection:
-    """A connection to a copy of a file and of its journals, which nobody else sees and which ends with it.
-
-    Without `log` what is in the log beside the file is left out.
+def private_copy(path: Path, *, log: bool = True) -> Database:
+    """A connection to a copy of a file and of its journals, in the present schema, which nobody else sees and which
+    ends with it. Without `log` what is in the log beside the file is left out.
     """
     try:
         with tempfile.TemporaryDirectory(prefix="list3r-") as folder:
@@ -261,16 +261,19 @@ def private_copy(path: Path, *, log: bool = True) -> sqlite3.Connection:
             ends = ("", "-wal", "-journal") if log else ("", "-journal")
             for end in (end for end in ends if Path(f"{path}{end}").exists()):
                 shutil.copyfile(f"{path}{end}", f"{copy}{end}")
-            return _without_journal(connected(copy, "rw"))
+            return _without_journal(path, connected(copy, "rw"))
     except OSError as error:
         raise MemoryFileError(f"{path} cannot be copied to be read: {error.strerror}") from error
 
 
-def _without_journal(database: sqlite3.Connection) -> sqlite3.Connection:
+def _without_journal(path: Path, database: Database) -> Database:
     """The same connection once what a journal undoes is undone; closed where that fails."""
     try:
-        for statement in ("SELECT count(*) FROM sqlite_master", "PRAGMA journal_mode=OFF"):
-            database.execute(statement).fetchall()
+        database.execute("SELECT count(*) FROM sqlite_master").fetchall()
+        if (version := identified(path, database)) < SCHEMA_VERSION:
+            database.execute("PRAGMA journal_mode=WAL").fetchall()
+            migrate(database, version)
+        database.execute("PRAGMA journal_mode=OFF").fetchall()
     except BaseException:
         database.close()
         raise
@@ -294,14 +297,14 @@ def check_beside(path: Path) -> None:
             raise MemoryFileError(f"{beside} has a name that {path.name} needs while it is written; move it away")
 
 
-def fold_in(database: sqlite3.Connection, wait_ms: int) -> None:
+def fold_in(database: Database, wait_ms: int) -> None:
     """Write the log into the one file and leave nothing beside it, unless somebody reads for longer than that."""
     for statement in (f"busy_timeout={wait_ms}", "wal_checkpoint(TRUNCATE)", "journal_mode=DELETE"):
-        with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(apsw.Error):
             database.execute(f"PRAGMA {statement}").fetchall()
 
 
-def reader(path: Path) -> sqlite3.Connection:
+def reader(path: Path) -> Database:
     """A connection for reading that writes nothing beside the file or into it.
 
     A file in the mode of a write-ahead log without the memory that its readers share (which a writer makes; a file that
@@ -320,10 +323,10 @@ def reader(path: Path) -> sqlite3.Connection:
         except BaseException:
             database.close()
             raise
-    except sqlite3.Error as error:
+    except apsw.Error as error:
         if not shared and _is_shared(path):
             return reader(path)
-        if getattr(error, "sqlite_errorname", "") in _UNREADABLE_HERE:
+        if {getattr(error, "result", 0), getattr(error, "extendedresult", 0)} & _UNREADABLE_HERE:
             return private_copy(path)
         raise
 
@@ -332,23 +335,19 @@ def _is_shared(path: Path) -> bool:
     return Path(f"{path}-wal").exists() and Path(f"{path}-shm").exists()
 
 
-def migrate(database: sqlite3.Connection, version: int) -> None:
-    """Bring a file forward to the present schema, in one transaction. Raises `sqlite3.DatabaseError` on damage."""
-    database.execute("BEGIN IMMEDIATE")
+def migrate(database: Database, version: int) -> None:
+    """Bring a file forward to the present schema, in one transaction. Raises `apsw.Error` on damage."""
+    if version:
+        database.begin("IMMEDIATE")
+    else:
+        database.execute("BEGIN IMMEDIATE")
     try:
-        if version >= SUMS_SINCE:
-            for bad in bad_rows(database, version):
-                raise sqlite3.DatabaseError(str(bad))
         for migration in MIGRATIONS[version:]:
-            for statement in migration.split(";"):
-                database.execute(statement)
-        write_words(database)
-        write_all(database)
+            database.execute(migration)
         database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-        database.execute("COMMIT")
+        database.commit()
     except BaseException:
-        if database.in_transaction:
-            database.execute("ROLLBACK")
+        database.roll_back()
         raise
 
 

@@ -12,12 +12,15 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import sqlite3
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
+
+import apsw
+
+from list3r.memory.store.database import Database
 
 _START = bytes.fromhex("c3a5f00d9be14c7e8f02d6b1774ae9d5")
 """How a mark begins; no text does, in any encoding that SQLite has."""
@@ -60,66 +63,63 @@ class Mark:
 
 
 class LogMark:
-    """Counts the transactions of one writing connection; the last of what follows the rows that change."""
+    """Counts the transactions of one writing connection."""
 
-    pending = False
-
-    def __init__(self, database: sqlite3.Connection) -> None:
+    def __init__(self, database: Database) -> None:
         self._database = database
-        self._changes = database.total_changes
+        self._changes = database.total_changes()
 
     def write(self) -> None:
         """Count the transaction that runs, where it changed anything."""
-        if self._database.total_changes != self._changes:
+        if self._database.total_changes() != self._changes:
             held = _held(self._database)
             assert held is not None, "a writer begins with `begin_marking`"
             self._database.execute("UPDATE log_mark SET mark = ?", (_next(held).packed(),))
-        self.forget()
 
     def forget(self) -> None:
         """What was written so far is counted or rolled back."""
-        self._changes = self._database.total_changes
+        self._changes = self._database.total_changes()
 
 
-def begin_marking(database: sqlite3.Connection) -> None:
+def begin_marking(database: Database) -> None:
     """Write the mark of a new writer into the file itself, which has no log then.
 
     Where a reader keeps the log of the last writer from being folded in, that writer is continued. Raises
-    `sqlite3.OperationalError` while others read.
+    `apsw.BusyError` while others read.
     """
-    if database.execute("PRAGMA journal_mode").fetchone()[0] == "wal":
+    if database.execute("PRAGMA journal_mode").fetchall()[0][0] == "wal":
         try:
             database.execute("PRAGMA journal_mode=DELETE").fetchall()
-        except sqlite3.OperationalError:
+        except apsw.BusyError:
             if _held(database) is None:
                 raise
             return
-    layout = int(database.execute("PRAGMA schema_version").fetchone()[0])
+    layout = int(database.execute("PRAGMA schema_version").fetchall()[0][0])  # type: ignore[arg-type]
     mark = Mark(secrets.token_bytes(16), 0, layout)
-    database.execute("BEGIN IMMEDIATE")
-    try:
-        database.execute("INSERT OR REPLACE INTO log_mark VALUES (1, ?)", (mark.packed(),))
-        database.execute("COMMIT")
-    except BaseException:
-        if database.in_transaction:
-            database.execute("ROLLBACK")
-        raise
+    with database.writing_into_the_file():
+        database.begin("IMMEDIATE")
+        try:
+            database.execute("INSERT OR REPLACE INTO log_mark VALUES (1, ?)", (mark.packed(),))
+            database.commit()
+        except BaseException:
+            database.roll_back()
+            raise
 
 
-def _held(database: sqlite3.Connection) -> Mark | None:
-    row = database.execute("SELECT mark FROM log_mark").fetchone()
-    return None if row is None else Mark.unpacked(row[0])
+def _held(database: Database) -> Mark | None:
+    rows = database.execute("SELECT mark FROM log_mark").fetchall()
+    return Mark.unpacked(rows[0][0]) if rows else None
 
 
 def _next(mark: Mark) -> Mark:
     return Mark(mark.writer, mark.commits + 1, mark.layout)
 
 
-def mark_of_file(alone: sqlite3.Connection) -> Mark | None:
+def mark_of_file(alone: Database) -> Mark | None:
     """The mark in a file that was opened without its log, as far as it can be read."""
     try:
-        mark, (layout,) = _held(alone), alone.execute("PRAGMA schema_version").fetchone()
-    except (sqlite3.Error, UnicodeError):
+        mark, ((layout,),) = _held(alone), alone.execute("PRAGMA schema_version").fetchall()
+    except (apsw.Error, UnicodeError):
         return None
     return mark if mark is not None and mark.layout == layout else None
 

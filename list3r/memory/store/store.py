@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from list3r.memory.errors import List3rError, MemoryFileError
-from list3r.memory.store.checksums import summed_tables
-from list3r.memory.store.connection import Connection, damaged, is_ours
+from list3r.memory.store.connection import Connection, is_ours
 from list3r.memory.store.derived import Derived
 from list3r.memory.store.facts import Facts
+from list3r.memory.store.file import damaged
 from list3r.memory.store.placed import PlacedTracks, PlacedTrajectory, Surfaces
-from list3r.memory.store.read_checks import BOXES, FAILURES, WORDS, damage_of
 from list3r.memory.store.tables.chunks import Chunks
 from list3r.memory.store.tables.edges import Bends, Edges
 from list3r.memory.store.tables.edits import Edits, MergeLog
@@ -44,39 +42,130 @@ class Store:
         self.connection = connection
         self.derived = Derived()
         """What is made of the memory and kept until it is closed."""
-        self.facts = Facts(connection)
-        self._add_measured(connection)
-        self._add_library(connection)
 
-    def _add_measured(self, connection: Connection) -> None:
-        """What chunks measured, and where they lie."""
-        self.sessions = Sessions(connection)
-        self.frames = Frames(connection)
-        self.keyframes = Keyframes(connection)
-        self.supports = Supports(connection)
-        self.local_instances = LocalInstances(connection, self.supports)
-        self.chunks = Chunks(connection, self.frames, self.keyframes, self.local_instances)
-        self.edges = Edges(connection)
-        self.bends = Bends(connection)
-        self.votes = LabelVotes(connection)
-        self.trajectory = PlacedTrajectory(self.chunks, self.frames, self.bends)
+    @cached_property
+    def facts(self) -> Facts:
+        """What is known of the memory as a whole."""
+        return Facts(self.connection)
 
-    def _add_library(self, connection: Connection) -> None:
-        """What is derived from that, and what operators said of it."""
-        self.pair_scores = PairScoreTable(connection)
-        self.merges = MergeLog(connection)
-        self.edits = Edits(connection)
-        self.ids = Ids(connection, self.facts, self.edits)
-        self.embeddings = Embeddings(connection)
-        self.relations = RelationTable(connection, self.ids)
-        self.events = Events(connection)
-        self.detected_labels = DetectedLabels(connection)
-        of_instance = self.embeddings, self.relations, self.events, self.detected_labels
-        self.instances = Instances(connection, self.ids, of_instance)
-        self.observations = Observations(connection, self.ids)
-        self.words = Words(connection)
-        self.surfaces = Surfaces(self.chunks, self.supports, self.instances, self.events)
-        self.tracks = PlacedTracks(
+    # ------------------------------------------------------------------ what chunks measured, and where they lie
+
+    @cached_property
+    def sessions(self) -> Sessions:
+        """The videos."""
+        return Sessions(self.connection)
+
+    @cached_property
+    def frames(self) -> Frames:
+        """The frames of the trajectory."""
+        return Frames(self.connection)
+
+    @cached_property
+    def keyframes(self) -> Keyframes:
+        """Frames by which places are found again."""
+        return Keyframes(self.connection)
+
+    @cached_property
+    def supports(self) -> Supports:
+        """Surfaces of local instances."""
+        return Supports(self.connection)
+
+    @cached_property
+    def local_instances(self) -> LocalInstances:
+        """What one chunk measured of one thing."""
+        return LocalInstances(self.connection, self.supports)
+
+    @cached_property
+    def chunks(self) -> Chunks:
+        """Chunks, and where each lies."""
+        return Chunks(self.connection, self.frames, self.keyframes, self.local_instances)
+
+    @cached_property
+    def edges(self) -> Edges:
+        """Relations of chunks."""
+        return Edges(self.connection)
+
+    @cached_property
+    def bends(self) -> Bends:
+        """How chunks bend."""
+        return Bends(self.connection)
+
+    @cached_property
+    def votes(self) -> LabelVotes:
+        """Votes for labels."""
+        return LabelVotes(self.connection)
+
+    @cached_property
+    def trajectory(self) -> PlacedTrajectory:
+        """Where the cameras were."""
+        return PlacedTrajectory(self.chunks, self.frames, self.bends)
+
+    # ------------------------------------------------------------------ what is derived, and what operators said of it
+
+    @cached_property
+    def pair_scores(self) -> PairScoreTable:
+        """How pairs of chunks overlap."""
+        return PairScoreTable(self.connection)
+
+    @cached_property
+    def merges(self) -> MergeLog:
+        """Decisions of merging."""
+        return MergeLog(self.connection)
+
+    @cached_property
+    def edits(self) -> Edits:
+        """What operators changed."""
+        return Edits(self.connection)
+
+    @cached_property
+    def ids(self) -> Ids:
+        """What ids stand for today."""
+        return Ids(self.connection, self.facts)
+
+    @cached_property
+    def embeddings(self) -> Embeddings:
+        """Vectors of instances."""
+        return Embeddings(self.connection)
+
+    @cached_property
+    def relations(self) -> RelationTable:
+        """Relations of instances."""
+        return RelationTable(self.connection, self.ids)
+
+    @cached_property
+    def events(self) -> Events:
+        """What changed between sessions."""
+        return Events(self.connection)
+
+    @cached_property
+    def detected_labels(self) -> DetectedLabels:
+        """Labels of detectors."""
+        return DetectedLabels(self.connection)
+
+    @cached_property
+    def words(self) -> Words:
+        """Words that name instances."""
+        return Words(self.connection)
+
+    @cached_property
+    def instances(self) -> Instances:
+        """The instances of the library."""
+        return Instances(self.connection, self.ids, self.words)
+
+    @cached_property
+    def observations(self) -> Observations:
+        """Which local instances an instance is."""
+        return Observations(self.connection, self.ids)
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        """Surfaces of instances in the world."""
+        return Surfaces(self.chunks, self.supports, self.instances, self.events)
+
+    @cached_property
+    def tracks(self) -> PlacedTracks:
+        """Where moving instances were."""
+        return PlacedTracks(
             (self.chunks, self.frames), (self.local_instances, self.supports), (self.instances, self.observations)
         )
 
@@ -135,27 +224,8 @@ class Store:
             raise MemoryFileError(damaged(self.path, found[0])) from error
 
     def verify(self) -> list[str]:
-        """Return every damage found: pages, checksums of rows and blobs, rows that point nowhere, boxes that lie.
+        """Return every damage found: pages, values that no row may hold, rows that point nowhere.
 
         Empty when the file is sound. One pass over the file; about 0.1 s for 25 MB.
         """
-        with self.connection.unchecked() as database:
-            return list(_damage(database))
-
-
-def _damage(database: sqlite3.Connection) -> Iterator[str]:
-    for text in _asked(database, "PRAGMA integrity_check"):
-        yield from (f"SQLite: {t}" for t in text if t != "ok")
-    for name in (*summed_tables(), BOXES, WORDS):
-        try:
-            yield from damage_of(database, name, pages=False)
-        except FAILURES as error:
-            yield f"{name}: {error}"
-
-
-def _asked(database: sqlite3.Connection, query: str) -> Iterator[tuple[Any, ...]]:
-    """Rows of a query; what SQLite says where it fails, as one row."""
-    try:
-        yield from database.execute(query)
-    except FAILURES as error:
-        yield (str(error),)
+        return self.connection.damage()

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.checksums import OWN_CRC, summed_tables
 from list3r.memory.store.connection import Arguments, Connection
 from list3r.memory.store.rows.codec import checksum
 from list3r.memory.store.rows.columns import UNREADABLE, Columns, Value
@@ -27,13 +26,10 @@ class Table(Generic[R]):
         order: str,
         *,
         source: str = "",
-        parts: tuple[str, ...] = (),
-        checked: bool = False,
+        summed: tuple[str, ...] = (),
     ) -> None:
-        """`order` are the columns that rows are ordered by, `source` what rows come from where that is a join.
-
-        Rows of a table that is not checked as a whole are compared with their checksums as they are read: one by one
-        where they are `checked` so, else with all that they stand among, in this table or in those named by `parts`.
+        """`order` are the columns that rows are ordered by, `source` what rows come from where that is a join; the
+        column `crc` tells one content of the `summed` columns from another.
         """
         self._connection = connection
         self._name = name
@@ -41,15 +37,23 @@ class Table(Generic[R]):
         self._order = order
         self._key = [name for name in order.split(", ") if name in columns.names]
         self._source = source or name
-        self._sealed = OWN_CRC.get(name, ())
-        self._checked = checked
+        self._sealed = summed
         self._select = f"SELECT {', '.join(columns.names)} FROM {self._source}"
-        self._parts = () if checked else parts or (name,)
 
     def all(self, where: str = "", arguments: Arguments = ()) -> list[R]:
         """Return the records for which a condition of SQL holds, all without one, in order."""
         condition = f" WHERE {where}" if where else ""
         return self._records(f"{self._select}{condition} ORDER BY {self._order}", arguments)
+
+    def in_batches(self, size: int = 1024) -> Iterator[list[R]]:
+        """Yield all records in the order of the one integer that is their key, so many at a time: a large table takes
+        no more room, and those that were yielded may be written.
+        """
+        query = f"{self._select} WHERE {self._order} > ? ORDER BY {self._order} LIMIT {size}"
+        last = -1
+        while records := self._records(query, (last,)):
+            yield records
+            last = getattr(records[-1], self._order)
 
     def first(self, where: str, arguments: Arguments = ()) -> R | None:
         """Return one record for which a condition holds."""
@@ -78,20 +82,9 @@ class Table(Generic[R]):
             raise MemoryFileError(f"{what}; run `list3r verify` on the file") from error
 
     def columns_of(self, names: Sequence[str], ids: Iterable[int]) -> Iterator[tuple[Any, ...]]:
-        """Yield some columns, as they are stored, of the rows with some ids, in no order.
-
-        Where the table is not checked as a whole, a row is read whole and checked when it is first asked for.
-        """
-        wanted = list(ids)
-        by_part = self._checked and self._connection.by_part(self._name)
-        fresh = self._connection.rows_unchecked(self._name, wanted) if by_part else []
-        place = [self._columns.names.index(name) for name in names]
-        whole = f"SELECT {', '.join(self._columns.names)} FROM {self._source} WHERE id IN ({{}})"
-        for part, marks in batches(fresh):
-            rows = self._connection.believed(self._name, self._connection.rows(whole.format(marks), part))
-            yield from (tuple(row[k] for k in place) for row in rows)
+        """Yield some columns, as they are stored, of the rows with some ids, in no order."""
         query = f"SELECT {', '.join(names)} FROM {self._source} WHERE id IN ({{}})"
-        for part, marks in batches(set(wanted).difference(fresh) if fresh else wanted):
+        for part, marks in batches(ids):
             yield from self._connection.rows(query.format(marks), part)
 
     def add(self, record: R, **more: Value) -> int:
@@ -129,19 +122,7 @@ class Table(Generic[R]):
 
     def _records(self, query: str, arguments: Arguments) -> list[R]:
         rows = self._connection.rows(query, arguments)
-        if not rows:
-            return []
-        if self._checked:
-            rows = self._connection.believed(self._name, rows)
-        for table in self._parts:
-            self._check_parts(table, rows)
         return self._columns.records(rows, self._name, self._key)
-
-    def _check_parts(self, table: str, rows: list[tuple[Any, ...]]) -> None:
-        first = summed_tables()[table].key[0]
-        if first in self._columns.names:
-            at = self._columns.names.index(first)
-            self._connection.sound(table, (row[at] for row in rows))
 
     def _written(self, records: list[R], more: dict[str, Value], verb: str) -> tuple[str, list[tuple[Value, ...]]]:
         """The statement that inserts records, and its arguments."""

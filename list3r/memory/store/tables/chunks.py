@@ -79,11 +79,11 @@ class Chunks:
         self._keyframes = keyframes
         self._local_instances = local_instances
         measured = Columns.of(_Measured, _INTRINSICS, _IMAGE_SIZE, _SAMPLES, index="chunk_index")
-        self._measured = Table(connection, "chunks", measured, "chunk_id")
+        self._measured = Table(connection, "chunks", measured, "chunk_id", summed=("cannot_link", "overlap"))
         self._placements = Table(connection, "placements", Columns.of(_Placement), "chunk_id")
         placed = Columns.of(ChunkRow, _INTRINSICS, _IMAGE_SIZE, index="chunk_index")
         both = "chunks JOIN placements USING (chunk_id)"
-        self._placed = Table(connection, "chunks", placed, "chunk_id", source=both, parts=("chunks",))
+        self._placed = Table(connection, "chunks", placed, "chunk_id", source=both)
         self._version = -1
         self._known: dict[int, ChunkRow] | None = None
         self._crcs: dict[int, int] | None = None

@@ -1,17 +1,21 @@
-"""Embeddings of instances in named spaces, and what changed among them since the store was opened."""
+"""Embeddings of instances in named spaces, each with the number of the change that wrote it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.errors import MemoryFileError
-from list3r.memory.store.checksums import PART_BITS, side_by_side, summed_tables
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.table import batches
+
+_SPACES = (
+    "WITH RECURSIVE held (space) AS (SELECT min(space) FROM embeddings UNION ALL"
+    " SELECT (SELECT min(e.space) FROM embeddings e WHERE e.space > held.space) FROM held WHERE held.space IS NOT NULL)"
+)
 
 
 class Embeddings:
@@ -19,57 +23,60 @@ class Embeddings:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self.touched: list[int] = []
-        """Instances whose vectors this store has written or dropped since it was opened, in order; may repeat."""
-        self.spaces_touched: set[str] = set()
-        """Spaces that this store has written to."""
 
     def put(self, space: str, ids: Sequence[int], vectors: NDArray[np.float32]) -> None:
         """Set the vectors of instances in a named space. `vectors` has shape (N, D)."""
-        self.touched += [int(i) for i in ids]
-        self.spaces_touched.add(space)
+        change = self.changes() + 1
         self._connection.execute_many(
-            "INSERT OR REPLACE INTO embeddings (instance, space, vector) VALUES (?, ?, ?)",
-            [(int(i), space, v.astype("<f4").tobytes()) for i, v in zip(ids, vectors, strict=True)],
+            "INSERT OR REPLACE INTO embeddings (instance, space, change, vector) VALUES (?, ?, ?, ?)",
+            [(int(i), space, change, v.astype("<f4").tobytes()) for i, v in zip(ids, vectors, strict=True)],
+        )
+
+    def changes(self) -> int:
+        """Return how often vectors were written or dropped."""
+        query = (
+            f"{_SPACES} SELECT max("
+            "coalesce(max((SELECT max(e.change) FROM embeddings e WHERE e.space = held.space)), 0),"
+            " coalesce((SELECT CAST(value AS INTEGER) FROM memory WHERE key = 'embedding changes'), 0)) FROM held"
+        )
+        return int(self._connection.rows(query)[0][0])
+
+    def changed(self, space: str, after: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return ids (N,) and vectors (N, D) of a named space that were written after a change."""
+        query = "SELECT instance, vector FROM embeddings WHERE space = ? AND change > ? ORDER BY instance"
+        return _vectors(self._connection.rows(query, (space, after)), space)
+
+    def unchanged(self, space: str, ids: Sequence[int], upto: int) -> list[tuple[int, bytes]]:
+        """Return those of some instances whose vectors were not written after a change, with these as they are."""
+        marks = ",".join("?" * len(ids))
+        query = f"SELECT instance, vector FROM embeddings WHERE instance IN ({marks}) AND space = ? AND change <= ?"
+        return self._connection.rows(query, (*ids, space, upto))
+
+    def of_the_file(self) -> bool:
+        """Return whether these are the vectors of the file, as they were committed, and not shown otherwise."""
+        return not self._connection.writing and not self._connection.rows(
+            "SELECT 1 FROM sqlite_temp_master WHERE name = 'embeddings'"
         )
 
     def all(self, space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return ids (N,) and vectors (N, D) of a named space."""
         query = "SELECT instance, vector FROM embeddings WHERE space = ? ORDER BY instance"
-        return self._checked(self._connection.rows(query, (space,)), space)
+        return _vectors(self._connection.rows(query, (space,)), space)
 
     def drop(self, instance_id: int) -> None:
         """Forget the vectors of an instance."""
-        self.touched.append(int(instance_id))
-        self._connection.execute("DELETE FROM embeddings WHERE instance = ?", (instance_id,))
+        change = self.changes() + 1
+        if self._connection.execute("DELETE FROM embeddings WHERE instance = ?", (instance_id,)).count:
+            value = "INSERT OR REPLACE INTO memory VALUES ('embedding changes', ?)"
+            self._connection.execute(value, (str(change),))
 
     def of(self, space: str, ids: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one.
-
-        In a large file each is compared with its own checksum, without the rows that it stands among.
-        """
+        """Return ids (N,), ascending, and vectors (N, D) of those of some instances (no aliases) that have one."""
         rows: list[tuple[Any, ...]] = []
         for part, marks in batches(ids):
-            query = f"SELECT instance, space, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
-            found = self._connection.rows(query, (*part, space))
-            rows += self._connection.believed("embeddings", found, keep=False)
-        return _vectors([(instance, vector) for instance, _, vector in sorted(rows)], space)
-
-    def seals(self) -> dict[int, bytes]:
-        """Return what changes when any vector of a part of the table does, by part; empty where it is being written."""
-        return self._connection.seals("embeddings")
-
-    def parts_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the parts of the table in which the vectors of instances stand. Shape (N,) each."""
-        return ids >> PART_BITS
-
-    def in_parts(self, space: str, parts: Iterable[int]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-        """Yield ids (n,) and vectors (n, D) of a named space that stand in some parts of the table, in order of ids."""
-        for name, some in side_by_side(("embeddings", part) for part in parts):
-            where, bounds = summed_tables()[name].where(some)
-            query = f"SELECT instance, vector FROM embeddings WHERE {where} AND space = ? ORDER BY instance"
-            if rows := self._connection.rows(query, (*bounds, space)):
-                yield self._checked(rows, space)
+            query = f"SELECT instance, vector FROM embeddings WHERE instance IN ({marks}) AND space = ?"
+            rows += self._connection.rows(query, (*part, space))
+        return _vectors(sorted(rows), space)
 
     def batches(self, space: str, size: int = 20_000) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
         """Yield ids (n,) and vectors (n, D) of a named space, in order of ids, at most `size` at a time."""
@@ -77,7 +84,7 @@ class Embeddings:
         query = "SELECT instance, vector FROM embeddings WHERE instance > ? AND space = ? ORDER BY instance LIMIT ?"
         while rows := self._connection.rows(query, (last, space, size)):
             last = rows[-1][0]
-            yield self._checked(rows, space)
+            yield _vectors(rows, space)
 
     def count(self, space: str) -> int:
         """Return how many vectors a named space holds."""
@@ -85,25 +92,20 @@ class Embeddings:
 
     def sample(self, space: str, size: int) -> NDArray[np.float32]:
         """Return about `size` vectors of a named space, spread evenly over it; all where there are fewer. (n, D)."""
+        return self.of(space, self.spread(space, size))[1]
+
+    def spread(self, space: str, size: int) -> list[int]:
+        """Return the ids of about `size` vectors of a named space, spread evenly over it; all where there are fewer."""
         stride = max(1, self.count(space) // size)
         query = (
-            "SELECT instance, vector FROM embeddings"
+            "SELECT instance FROM embeddings"
             " WHERE space = ? AND ((instance % 1000003) * 2654435761 >> 7) % ? = 0 ORDER BY instance"
         )
-        return _vectors(self._connection.rows(query, (space, stride)), space)[1]
+        return [n for (n,) in self._connection.rows(query, (space, stride))]
 
     def spaces(self) -> list[str]:
         """Return the named spaces that hold vectors."""
-        query = (
-            "WITH RECURSIVE held (space) AS (SELECT min(space) FROM embeddings UNION ALL"
-            " SELECT (SELECT min(e.space) FROM embeddings e WHERE e.space > held.space) FROM held"
-            " WHERE held.space IS NOT NULL) SELECT space FROM held WHERE space IS NOT NULL"
-        )
-        return [r[0] for r in self._connection.rows(query)]
-
-    def _checked(self, rows: list[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        self._connection.sound("embeddings", (row[0] for row in rows))
-        return _vectors(rows, space)
+        return [r[0] for r in self._connection.rows(f"{_SPACES} SELECT space FROM held WHERE space IS NOT NULL")]
 
 
 def _vectors(rows: Sequence[tuple[Any, ...]], space: str) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
+import numpy as np
+
+from list3r.memory.geometry import OrientedBox
 from list3r.memory.records import ChangeEvent
 from list3r.memory.store.connection import Connection
-from list3r.memory.store.rows.columns import Columns
+from list3r.memory.store.rows.codec import raw_array
+from list3r.memory.store.rows.columns import Column, Columns, joined
 from list3r.memory.store.rows.table import Table
+
+
+def _pack(box: OrientedBox | None) -> tuple[Any, ...]:
+    if box is None:
+        return None, None, None, None
+    rest = np.concatenate([box.size, box.rotation.ravel()]).astype("<f8").tobytes()
+    return *map(float, box.center), rest
+
+
+def _unpack(x: float, y: float, z: float, rest: bytes | None) -> tuple[OrientedBox | None]:
+    if rest is None:
+        return (None,)
+    values = raw_array(rest, "<f8", (12,), "the box").copy()
+    return (OrientedBox(np.array([x, y, z], np.float64), values[:3], values[3:].reshape(3, 3)),)
+
+
+def _box(end: str) -> Column:
+    """The columns of the box where something was before or after; its centre is plain."""
+    return joined((f"{end}_x", f"{end}_y", f"{end}_z", f"{end}_box"), (f"{end}_box",), _pack, _unpack)
+
+
+_COLUMNS = Columns(ChangeEvent, _box("from"), _box("to"), instance_id="instance")
 
 
 class Events:
@@ -15,8 +42,7 @@ class Events:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        columns = Columns.of(ChangeEvent, instance_id="instance")
-        self._rows = Table(connection, "events", columns, "session_id, instance")
+        self._rows = Table(connection, "events", _COLUMNS, "session_id, instance")
 
     def replace(self, events: Iterable[ChangeEvent], after: int = 0) -> None:
         """Forget all events of sessions `after` one and write these; call inside `transaction()`."""

@@ -123,7 +123,6 @@ class Keyframes:
         """Return Frame.index of the keyframes of a chunk that have a picture, in order."""
         query = "SELECT frame_index FROM keyframes WHERE chunk_id = ? AND length(jpeg) > 0 ORDER BY frame_index"
         rows = self._connection.rows(query, (chunk_id,))
-        self._connection.sound("keyframes", (chunk_id for _ in rows))
         return [int(row[0]) for row in rows]
 
     def get(self, chunk_id: int, frame_index: int) -> Keyframe:
@@ -142,7 +141,6 @@ class Keyframes:
         where = "" if chunk_ids is None else f"WHERE chunk_id IN ({','.join(str(int(k)) for k in chunk_ids)})"
         query = f"SELECT chunk_id, frame_index, descriptor FROM keyframes {where} ORDER BY chunk_id, frame_index"
         rows = self._connection.rows(query)
-        self._connection.sound("keyframes", (row[0] for row in rows))
         rows = [row for row in rows if any(row[2])]
         keys = np.array([(r[0], r[1]) for r in rows], dtype=np.int64).reshape(-1, 2)
         out = np.zeros((len(rows), len(rows[0][2]) // 4 if rows else 0), np.float32)

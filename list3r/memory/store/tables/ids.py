@@ -24,10 +24,9 @@ class _Alias:
 class Ids:
     """The table of aliases beside the ids of instances. What writes is called inside `transaction()`."""
 
-    def __init__(self, connection: Connection, facts: Facts, edits: Edits) -> None:
+    def __init__(self, connection: Connection, facts: Facts) -> None:
         self._connection = connection
         self._facts = facts
-        self._edits = edits
         self._aliases = Table(connection, "aliases", Columns.of(_Alias), "id")
 
     def resolve(self, instance_id: int) -> int:
@@ -100,5 +99,5 @@ class Ids:
         while aliases.get(instance_id, instance_id) not in names:
             instance_id = aliases[instance_id]
             names.add(instance_id)
-        deletions = [e for e in standing(self._edits.all()) if e.kind == "delete"]
+        deletions = [e for e in standing(Edits(self._connection).all()) if e.kind == "delete"]
         return next((e.entry for e in deletions if any(n in names for n, _, _ in e.before)), None)

@@ -21,27 +21,28 @@ from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.labels import DetectedLabels
 from list3r.memory.store.tables.relations import RelationTable
+from list3r.memory.store.tables.words import Words
 
 Array = NDArray[np.float64]
+_RANK = ("id", "confidence", "state", "structure", "max(size_x, size_y, size_z)")
 _KEPT_RANKS = 500_000
 """Instances whose ranks are kept; 13 MB."""
 
 
-def _pack_geometry(center: Array, aabb: Array, box: OrientedBox) -> tuple[bytes]:
-    parts = [center, aabb.ravel(), box.center, box.size, box.rotation.ravel()]
-    return (np.concatenate(parts).astype("<f8").tobytes(),)
+_GEOMETRY = ("center_x", "center_y", "center_z", "size_x", "size_y", "size_z", "geometry")
 
 
-def _geometry(blobs: Sequence[bytes]) -> Array:
-    """What `_pack_geometry` packs. Shape (N, 24)."""
-    return raw_array(b"".join(blobs), "<f8", (len(blobs), 24), "the geometry").copy()
+def _pack_geometry(center: Array, aabb: Array, box: OrientedBox) -> tuple[Any, ...]:
+    rest = np.concatenate([aabb.ravel(), box.center, box.rotation.ravel()]).astype("<f8").tobytes()
+    return *map(float, center), *map(float, box.size), rest
 
 
-def _read_geometry(blobs: Sequence[bytes]) -> list[list[Any]]:
+def _read_geometry(*columns: Sequence[Any]) -> list[list[Any]]:
     """Centres, axis-aligned boxes and boxes of many rows at once."""
-    g = _geometry(blobs)
-    boxes = map(OrientedBox, g[:, 9:12], g[:, 12:15], g[:, 15:24].reshape(-1, 3, 3))
-    return [list(g[:, :3]), list(g[:, 3:9].reshape(-1, 2, 3)), list(boxes)]
+    plain = np.array(columns[:6], np.float64).T
+    rest = raw_array(b"".join(columns[6]), "<f8", (len(plain), 18), "the geometry").copy()
+    boxes = map(OrientedBox, rest[:, 6:9], plain[:, 3:], rest[:, 9:18].reshape(-1, 3, 3))
+    return [list(plain[:, :3]), list(rest[:, :6].reshape(-1, 2, 3)), list(boxes)]
 
 
 def _pack_view(view: BestView | None) -> tuple[int | None, int | None, bytes | None]:
@@ -58,7 +59,7 @@ def _read_views(*columns: Sequence[Any]) -> list[list[BestView | None]]:
 
 _COLUMNS = Columns(
     Instance,
-    replace(joined(("geometry",), ("center", "aabb", "box"), _pack_geometry, tuple), read=_read_geometry),
+    replace(joined(_GEOMETRY, ("center", "aabb", "box"), _pack_geometry, tuple), read=_read_geometry),
     joined(
         ("color_rgb",),
         ("color_rgb",),
@@ -103,31 +104,25 @@ def _is_in(ids: NDArray[np.int64], known: NDArray[np.int64]) -> NDArray[np.bool_
 
 
 def _ranks(rows: Sequence[tuple[Any, ...]]) -> Ranks:
-    """Ranks of rows (id, confidence, state, structure, geometry)."""
-    ids, confidence, state, structure, geometry = zip(*rows, strict=True) if rows else ((), (), (), (), ())
+    """Ranks of rows (id, confidence, state, structure, longest edge)."""
+    ids, confidence, state, structure, longest = zip(*rows, strict=True) if rows else ((), (), (), (), ())
     return Ranks(
         np.array(ids, np.int64),
         np.array(confidence, np.float64),
         np.array([s == "removed" for s in state], bool),
         np.array([s is not None for s in structure], bool),
-        _geometry(geometry)[:, 12:15].max(axis=1),
+        np.array(longest, np.float64),
     )
 
 
 class Instances:
     """The table of instances and the R*Tree of their boxes. What writes is called inside `transaction()`."""
 
-    def __init__(
-        self,
-        connection: Connection,
-        ids: Ids,
-        of_instance: tuple[Embeddings, RelationTable, Events, DetectedLabels],
-    ) -> None:
-        """`of_instance` are the tables whose rows go with an instance."""
+    def __init__(self, connection: Connection, ids: Ids, words: Words) -> None:
         self._connection = connection
         self._ids = ids
-        self._embeddings, self._relations, self._events, self._labels = of_instance
-        self._rows = Table(connection, "instances", _COLUMNS, "id", checked=True)
+        self._words = words
+        self._rows = Table(connection, "instances", _COLUMNS, "id")
         self._ranked = _ranks([])
         self._ranked_in: object = None
         """State of the file in which they were read."""
@@ -150,16 +145,18 @@ class Instances:
         """Write instances, new or changed, with their boxes in the R*Tree."""
         records = list(instances)
         self._rows.put(records)
+        self._words.put(records)
         self._put_boxes((i.id, i.aabb) for i in records)
 
     def drop(self, instance_id: int, alias_of: int | None) -> None:
         """Take an instance out; its id lives on as an alias of another, or resolves no more."""
         self._rows.delete("id = ?", (instance_id,))
         self._connection.execute("DELETE FROM instance_boxes WHERE id = ?", (instance_id,))
-        self._embeddings.drop(instance_id)
-        self._labels.drop(instance_id)
-        self._relations.drop(instance_id)
-        self._events.drop(instance_id, alias_of)
+        self._words.drop(instance_id)
+        for table in (Embeddings, DetectedLabels):
+            table(self._connection).drop(instance_id)
+        RelationTable(self._connection, self._ids).drop(instance_id)
+        Events(self._connection).drop(instance_id, alias_of)
         if alias_of is not None:
             self._ids.add_aliases({instance_id: alias_of})
 
@@ -173,7 +170,9 @@ class Instances:
         wanted = np.sort(ids)
         fresh = wanted[~_is_in(wanted, self._ranked.ids)]
         if len(fresh):
-            rows = self._rows.columns_of(("id", "confidence", "state", "structure", "geometry"), fresh.tolist())
+            rows = self._rows.columns_of(
+                ("id", "confidence", "state", "structure", "max(size_x, size_y, size_z)"), fresh.tolist()
+            )
             self._ranked = self._ranked.with_more(_ranks(list(rows)))
         held = wanted[_is_in(wanted, self._ranked.ids)]
         return self._ranked.among(np.searchsorted(self._ranked.ids, held))
@@ -182,6 +181,7 @@ class Instances:
         """Name instances, by id; None takes a name away."""
         statement = "UPDATE instances SET label = ? WHERE id = ?"
         self._connection.execute_many(statement, [(text, n) for n, text in sorted(labels.items())])
+        self._words.put(self.of(sorted(labels)))
 
     def count(self) -> tuple[int, int]:
         """Return how many things and how many pieces of structure there are."""
@@ -229,11 +229,13 @@ class Instances:
         rows = self._connection.rows("SELECT data FROM instance_boxes_node WHERE nodeno = 1")
         return _bounds(rows[0][0]) if rows and len(rows[0][0]) >= 4 else None
 
-    def index_boxes(self) -> None:
-        """Fill the R*Tree again from the instances."""
-        rows = self._connection.rows("SELECT id, geometry FROM instances ORDER BY id")
+    def index_again(self) -> None:
+        """Fill the R*Tree and the words again from the instances."""
         self._connection.execute("DELETE FROM instance_boxes")
-        self._put_boxes((n, np.frombuffer(g, "<f8")[3:9].reshape(2, 3)) for n, g in rows)
+        self._connection.execute("INSERT INTO words (words) VALUES ('delete-all')")
+        for instances in self._rows.in_batches():
+            self._words.put(instances)
+            self._put_boxes((i.id, i.aabb) for i in instances)
 
     def _put_boxes(self, boxes: Iterable[tuple[int, Array]]) -> None:
         statement = "INSERT OR REPLACE INTO instance_boxes VALUES (?, ?, ?, ?, ?, ?, ?)"

@@ -125,9 +125,7 @@ class Supports:
         order, columns = "chunk_id, local_id", Columns.of(LocalSupport, _SUPPORT)
         self._rows = Table(connection, "supports", columns, order)
         of_instances = "observations JOIN supports USING (chunk_id, local_id)"
-        self._observed = Table(
-            connection, "supports", columns, order, source=of_instances, parts=("observations", "supports")
-        )
+        self._observed = Table(connection, "supports", columns, order, source=of_instances)
 
     def add(self, chunk_id: int, local_id: int, support: Support) -> None:
         """Store the surface of a local instance, chunk coordinates."""
@@ -166,9 +164,7 @@ class LocalInstances:
         self._rows = Table(connection, "local_instances", columns, order)
         self._measured = Table(connection, "local_instances", _INSTANCE, order)
         nodes = "local_instances JOIN chunks USING (chunk_id) JOIN supports USING (chunk_id, local_id)"
-        self._nodes = Table(
-            connection, "local_instances", _NODE, order, source=nodes, parts=("local_instances", "supports")
-        )
+        self._nodes = Table(connection, "local_instances", _NODE, order, source=nodes)
 
     def add(self, chunk_id: int, instance: LocalInstance, *, scrap: bool = False) -> None:
         """Store one more local instance or scrap of a chunk, under a local id that the chunk does not have yet."""
@@ -198,7 +194,6 @@ class LocalInstances:
 
     def mask_track(self, chunk_id: int, local_id: int) -> MaskTrack:
         """Return the masks of one local instance. Raises `MemoryFileError` when it is not there."""
-        self._connection.sound("local_instances", [chunk_id])
         found: list[MaskTrack] = self._measured.values("track", _ONE, (chunk_id, local_id))
         if not found:
             raise MemoryFileError(f"{self._connection.path} has no local instance {local_id} in chunk {chunk_id}")
@@ -206,7 +201,6 @@ class LocalInstances:
 
     def motion_track(self, chunk_id: int, local_id: int) -> MotionTrack | None:
         """Return where a moving local instance was, chunk coordinates; None for one that does not move."""
-        self._connection.sound("local_instances", [chunk_id])
         found: list[MotionTrack | None] = self._measured.values("motion", _ONE, (chunk_id, local_id))
         return found[0] if found else None
 
@@ -220,13 +214,11 @@ class LocalInstances:
 
     def dynamic(self, chunk_id: int) -> list[int]:
         """Return the local ids of a chunk's instances that move."""
-        self._connection.sound("local_instances", [chunk_id])
         query = "SELECT local_id FROM local_instances WHERE chunk_id = ? AND dynamic ORDER BY local_id"
         return [int(n) for (n,) in self._connection.rows(query, (chunk_id,))]
 
     def structure(self, chunk_ids: Sequence[int]) -> set[tuple[int, int]]:
         """Return (chunk id, local id) of those of some chunks that are flagged as structure."""
-        self._connection.sound("local_instances", chunk_ids)
         query = "SELECT chunk_id, local_id FROM local_instances WHERE structure AND chunk_id IN ({})"
         parts = [self._connection.rows(query.format(marks), part) for part, marks in batches(chunk_ids)]
         return {(int(k), int(n)) for rows in parts for k, n in rows}

@@ -25,9 +25,7 @@ class RelationTable:
     def __init__(self, connection: Connection, ids: Ids) -> None:
         self._connection = connection
         self._ids = ids
-        order, columns = "subject, predicate, object", Columns.of(Relation)
-        self._rows = Table(connection, "relations", columns, order, checked=True)
-        self._unchecked = Table(connection, "relations", columns, order)
+        self._rows = Table(connection, "relations", Columns.of(Relation), "subject, predicate, object")
         self._kept: CurrentCache[tuple[str, str, tuple[str, ...]], NDArray[np.int64]] = CurrentCache(
             connection.stamp, _KEPT_BYTES, lambda pairs: pairs.nbytes
         )
@@ -57,7 +55,7 @@ class RelationTable:
     def among(self, ids: Iterable[int], predicates: Sequence[str], *, as_object: bool) -> list[Relation]:
         """Return the relations of some predicates in which some instances are the subject, or the object."""
         column, kinds = "object" if as_object else "subject", ",".join("?" * len(predicates))
-        return self._unchecked.among(column, sorted(map(int, ids)), f"predicate IN ({kinds})", predicates)
+        return self._rows.among(column, sorted(map(int, ids)), f"predicate IN ({kinds})", predicates)
 
     def pairs(
         self, predicates: Sequence[str], subjects: Iterable[int] | None, objects: Iterable[int] | None
