@@ -1,10 +1,10 @@
-"""Bend chunks so that shared frames and loop closures agree: a graph of nodes within chunks (paper A.1 has anchors
-every 50 frames).
+"""Deform chunks so that shared frames and loop closures agree: a graph of nodes within chunks (in the paper's A.1 a
+node every 50 frames).
 
-The graph of chunks (`pose_graph`) decides which edges are believed. Here every chunk is cut into nodes (`chunk_nodes`);
-neighbouring nodes are tied as stiffly as the overlaps show that chunks are, nodes of two chunks by the frames that both
-hold, and loops hold the nodes of the frames that they were found at. The same solver places all nodes; their mean
-places the chunk, and what is left is the chunk's bend. What it gains: research/association 0043.
+The graph of chunks (`pose_graph`) decides which edges are inliers. Every chunk is cut into nodes (`chunk_nodes`): its
+neighbouring nodes are tied as stiffly as overlaps show, nodes of two chunks by their shared frames, and nodes of a
+loop's two frames by the loop. The same solver places all nodes; their mean places the chunk, and the remainder is the
+chunk's non-rigid correction. The gain: research/association 0043.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from list3r.memory.records import Edge
 Array = NDArray[np.float64]
 
 _NOTHING = 1e9
-"""Variance factor of edges that are not believed, so that what they alone join stays where it is."""
+"""Variance factor of outlier edges, so that components that only they join stay in place."""
 _STEPS = 10
-"""Most steps of the solution; it starts near."""
+"""Most steps of the solution; its start is near."""
 
 
 @dataclass(frozen=True)
 class NodeGraphParts:
-    """What the graph is made of."""
+    """The inputs of the node graph."""
 
     nodes: dict[int, ChunkNodes]
     """By chunk id."""
     relations: list[tuple[Edge, FrameRelations]]
-    """Of adjacent edges that are believed."""
+    """Of inlier adjacent edges."""
     chunks: SampledChunks
-    """Where it comes from."""
+    """The samples that nodes and relations come from."""
 
     @cached_property
     def first(self) -> dict[int, int]:
@@ -72,10 +72,10 @@ def bend_chunks(
     weights: GraphSettings | None = None,
     turning: Collection[int] = (),
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """Return the graph with every chunk where its nodes are on average, and the bend of each chunk.
+    """Return the graph with every chunk at the mean of its nodes, and the non-rigid correction of each chunk.
 
-    The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given), `turning`
-    ones lose scale where their camera turns; chunks without posed frames have no bend.
+    The first chunk of each component stays in place. `rigid` chunks do not deform (their poses were given), `turning`
+    ones lose scale where their camera rotates; chunks without posed frames have no correction.
     """
     chosen = settings or NodeSettings()
     known = graph.S_graph_chunk
@@ -112,7 +112,7 @@ def _problem(
     weights: GraphSettings,
     turning: Collection[int],
 ) -> GraphProblem:
-    """Lay out all nodes and all that ties them."""
+    """Lay out all nodes and all ties between them."""
     first = pieces.first
     ends: list[tuple[int, int]] = []
     between: list[Sim3] = []
@@ -138,8 +138,8 @@ def _problem(
         if ties:
             tied.add((edge.u, edge.v))
     size = 6 if metric else 7
-    # Where scale is known it is not one more unknown: the block of the inverse, not the inverse of the block. Else what
-    # ratios of depths leave open would let a chunk slide towards its origin, however far that is.
+    # Where scale is known it is no unknown: the block of the inverse, not the inverse of the block. Otherwise the
+    # uncertainty of depth ratios would let a chunk slide towards its origin, however far away that is.
     information = inverses(np.array(covariances).reshape(-1, 7, 7))[:, :size, :size]
     rest = [e for e in believed if e.kind != "adjacent" or (e.u, e.v) not in tied]
     for edge in rest:
@@ -157,8 +157,8 @@ def _problem(
 
 
 def _whole(edge: Edge, nodes: Mapping[int, ChunkNodes]) -> Tie:
-    """Return an edge that holds the nodes of the frames that it was found at; the ends that face each other where it
-    does not say (its information is that of the edge)."""
+    """Return an edge as a tie of the nodes of its two frames; of the ends that face each other where it has no frames
+    (its information is that of the edge)."""
     u, v = nodes[edge.u], nodes[edge.v]
     if edge.frames is not None:
         return Tie(u.nearest(edge.frames[0]), v.nearest(edge.frames[1]), edge.S_v_u, np.eye(7))
@@ -171,8 +171,8 @@ def _settled(
     graph: GraphResult,
     rigid: Collection[int],
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """Place the chunks at the mean of their nodes, moved so that the first chunk of each component stays, and their
-    bends."""
+    """Place the chunks at the mean of their nodes, moved so that the first chunk of each component stays, and return
+    their non-rigid corrections."""
     chunks = list(nodes)
     sizes = [len(nodes[c].at) for c in chunks]
     owner, weight = np.repeat(np.arange(len(chunks)), sizes), np.concatenate([nodes[c].count for c in chunks])

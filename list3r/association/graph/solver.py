@@ -14,9 +14,9 @@ from list3r.memory.geometry import Sim3, skew, take
 Array = NDArray[np.float64]
 
 _CONVERGED = 1e-12
-"""Relative gain of a step at which the cost has settled."""
+"""Relative gain of a step at which the cost has converged."""
 _TOGETHER = 256
-"""Edges whose derivatives are held at once."""
+"""Edges whose derivatives are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class GraphProblem:
 
     def solve(self, poses: Sim3, trust: Array, iterations: int, settled: float = _CONVERGED) -> Sim3:
         """Return the poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`, until a step
-        gains less than a share `settled` of the cost. Shape of trust (E,)."""
+        gains less than a share `tolerance` of the cost. Shape of trust (E,)."""
         if len(self.u) == 0 or not (~self.fixed).any():
             return poses
         damping = 0.0
