@@ -1,10 +1,10 @@
-"""What the instances of two chunks say of whether both saw one place (paper 3.2: s_sem, s_rel, s_loop).
+"""Compare the instances of two chunks as evidence for a revisit (paper 3.2: s_sem, s_rel, s_loop).
 
 Pairs P_uv are mutual nearest neighbours in the feature space, and s_sem is their mean cosine. The layout score s_rel
 does not depend on the unknown scale and rotation between the chunks: distances between matched instances are compared
-by their ratio, and triples of instances by the side from which they run clockwise, seen from above. Look-alikes make
-nearest neighbours wrong, so the layout is scored on the largest consistent set of pairs among several candidates for
-each instance; a place that only holds the same kinds of things has no such set, and s_rel vetoes it.
+by their ratio, and triples of instances by their orientation, seen from above. Repeated objects make nearest neighbours
+wrong, so the layout is scored on the largest consistent set of pairs among several candidates for each instance; a
+place with merely the same kinds of objects has no such set, and s_rel vetoes it.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ class CueSettings:
     """How instances of two chunks are compared."""
 
     least_cosine: float = 0.5
-    """Least cosine of two features for their instances to be candidates for one thing."""
+    """Least cosine of two features for their instances to be candidates for one object."""
     candidates: int = 3
     """Most candidates for an instance."""
     look_alike: float = 0.08
-    """Candidates whose cosine is this much below the best are look-alikes as well."""
+    """Candidates within this of the best cosine are kept as well."""
     most_instances: int = 40
     """Instances compared of a chunk, those seen in most frames first."""
     sigma: float = 0.15
     """Difference of two log distances at which a pair of pairs counts 1/e."""
     least_lean: float = 0.25
-    """Least height of a triple's normal over its area, in [0, 1], from which its turning direction seen from above
+    """Least height of a triple's normal over its area, in [0, 1], from which its orientation seen from above
     counts."""
     consistent: float = 0.37
     """Least score of a pair of pairs for both to belong to one layout (1/e: one sigma)."""
@@ -45,14 +45,14 @@ class CueSettings:
 
 @dataclass(frozen=True)
 class InstanceSet:
-    """The instances of one chunk that can be recognised: what stands still and is no structure, N of them."""
+    """The instances of one chunk that can be recognised: static and no structure, N of them."""
 
     local_id: Ints
     """Shape (N,)."""
     feature: Array
     """Unit length. Shape (N, D)."""
     center: Array
-    """Middle of the support, chunk units. Shape (N, 3)."""
+    """Centre of the support, chunk units. Shape (N, 3)."""
     size: Array
     """Diagonal of the support's box without its outermost tenths, chunk units. Shape (N,)."""
     up: Array
@@ -63,7 +63,7 @@ class InstanceSet:
 
 @dataclass(frozen=True)
 class InstanceCues:
-    """How the instances of two chunks agree."""
+    """Agreement of the instances of two chunks."""
 
     s_sem: float
     """Mean cosine of the mutual nearest neighbours, in [0, 1]; 0 without any."""
@@ -83,7 +83,7 @@ def instance_set(
 ) -> InstanceSet:
     """Return the instances of a chunk from its local nodes and the poses (G, 4, 4) of its cameras.
 
-    Structure, what moves, and what has no finite feature or no support is left out.
+    Structure, movers, and instances without a finite feature or support are left out.
     """
     usable = [n for n in nodes if not n.structure and not n.dynamic and _sound(n)]
     usable = sorted(usable, key=lambda n: (-len(n.frames), n.local_id))[: settings.most_instances]
@@ -108,7 +108,7 @@ def _sound(node: LocalNode) -> bool:
 
 
 def compare_instances(u: InstanceSet, v: InstanceSet, settings: CueSettings | None = None) -> InstanceCues:
-    """Tell how the instances of two chunks agree. Features of two spaces cannot be compared and give no cues."""
+    """Compare the instances of two chunks. Features of two spaces cannot be compared and give no similarity."""
     chosen = settings or CueSettings()
     if u.space != v.space or not len(u.local_id) or not len(v.local_id) or u.feature.shape[1] != v.feature.shape[1]:
         return NO_CUES
@@ -134,7 +134,7 @@ def _mutual(cosine: Array, settings: CueSettings) -> Ints:
 
 
 def _candidates(cosine: Array, settings: CueSettings) -> Ints:
-    """Return pairs of instances that may be one thing: near the best of either side. Shape (M, 2)."""
+    """Return pairs of instances that may be one object: near the best of either side. Shape (M, 2)."""
     out = np.zeros(cosine.shape, bool)
     for axis in (0, 1):
         best = cosine.max(axis=axis, keepdims=True)
@@ -180,7 +180,7 @@ def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettin
     apart = (i[:, None] != i[None]) & (j[:, None] != j[None])
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(apart & (d_u > 1e-12) & (d_v > 1e-12), np.log(d_v / d_u), np.nan)
-        # A thing seen from one side only has its middle off by a part of its size.
+        # The centre of an instance seen from one side only is off by a part of its size.
         loose = [np.hypot(s[:, None], s[None]) / np.maximum(d, 1e-12) for s, d in ((u.size[i], d_u), (v.size[j], d_v))]
     return ratio, settings.sigma * np.clip(np.maximum(loose[0], loose[1]), 0.5, 2.0)
 
@@ -223,7 +223,7 @@ def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]
 
 
 def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> float:
-    """2 f - 1, at least 0; f: share of triples that run the same way round seen from above. 1 where none tells."""
+    """2 f - 1, at least 0; f: share of triples of equal orientation seen from above. 1 without a triple that counts."""
     if not u.up.any() or not v.up.any():
         return 1.0
     triples = np.array(list(itertools.combinations(range(len(pairs)), 3))[:2000])

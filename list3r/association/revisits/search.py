@@ -1,14 +1,14 @@
 """Find loop closures (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
 
 1. Frame descriptors propose candidates with a relaxed threshold (`frame_search`).
-2. The instances of the two chunks add s_sem and s_rel (`cues`). Candidates are ranked by
+2. The instances of the two chunks add s_sem and s_rel (`instance_similarity`). Candidates are ranked by
    s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel).
 3. The best are verified by the keyframes' features and depth (`verification`) or, where keyframes have none, by a joint
    window (`joint_window`). Where networks make the chunks, a joint window is also tried after features failed.
 4. A relation that the chain of accepted edges contradicts is refused (`chain`).
 
-Every candidate becomes an edge, accepted or not, with its scores and the reason. How the weights were chosen:
-research/association 0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as the paper writes it.
+Every candidate becomes an edge, accepted or not, with its scores and the reason. The choice of the weights:
+research/association 0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as in the paper.
 """
 
 from __future__ import annotations
@@ -72,14 +72,14 @@ class RevisitSettings:
     enough: int = 8
     """Accepted edges after which no further candidate of a chunk is verified."""
     second_opinions: int = 0
-    """Most joint windows of a chunk where keyframes with features and depth were compared in vain. For RGB-D they cost
+    """Most joint windows of a chunk for keyframes with features and depth that were rejected. For RGB-D they cost
     seconds each and find little more (redkitchen)."""
     of_networks: int = 3
-    """The same where a network makes the chunks: three passes over 40 frames are about what the chunk itself took, and
-    a network relates views that share too little for features (research/association 0151)."""
+    """The same where a network makes the chunks: three passes over 40 frames take about as long as the chunk itself,
+    and a network relates views that share too little for features (research/association 0151)."""
     most_ambiguous: float = 2.0
-    """Relations that agree on where a part of the video lies that nothing tied to the rest before, for each one that
-    says otherwise."""
+    """Least ratio of the relations that agree on the place of another component to those that contradict them, for
+    them to be accepted."""
     layout_pairs: int = 5
     """Instances that must agree on a layout for its scale to count."""
     most_scale_ratio: float = 1.6
@@ -90,16 +90,16 @@ class RevisitSettings:
     window: WindowSettings = field(default_factory=WindowSettings)
     chain: ChainSettings = field(default_factory=ChainSettings)
     things: ThingSearchSettings = field(default_factory=ThingSearchSettings)
-    """Where frames that look alike do not suffice."""
+    """Used where similar frames do not suffice."""
     second_looks: SecondLookSettings = field(default_factory=SecondLookSettings)
-    """Where a single relation ties a session to another."""
+    """Used where a single relation joins two sessions."""
     all_keyframes: AllKeyframesSettings = field(default_factory=AllKeyframesSettings)
-    """Where frames that look alike do not place a session."""
+    """Used where similar frames do not place a session."""
 
 
 @dataclass(frozen=True)
 class ScoredCandidate:
-    """A candidate with what the instances of its two chunks say."""
+    """A candidate with the similarity of the instances of its two chunks."""
 
     candidate: Candidate
     cues: InstanceCues
@@ -129,7 +129,7 @@ def find_loops(
 def _by_frames(
     store: Store, chunk_id: int, search: RevisitSearch, joint: JointReconstructor | None, chosen: RevisitSettings
 ) -> list[Edge]:
-    """Find the loop edges between a chunk and those with frames that look like its own. The edges may contradict."""
+    """Find the loop edges between a chunk and those with similar frames. The edges may contradict each other."""
     candidates = find_candidates(store, chunk_id, chosen.search)
     edges: list[Edge] = []
     tried = 0
@@ -194,7 +194,7 @@ def _comparable(keyframe: Keyframe) -> bool:
 
 
 class InstanceSets(LruCache[int, tuple[object, InstanceSet]]):
-    """Instances of the chunks that were compared last, with what they were made of."""
+    """Instances of the chunks that were compared last, with a key of their inputs."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, lambda held: held[1].feature.nbytes + held[1].center.nbytes)
@@ -215,7 +215,7 @@ class RevisitSearch:
         self._second_opinions = settings.second_opinions
 
     def cues(self, u: int) -> InstanceCues:
-        """Tell how the instances of a stored chunk agree with those of the new one."""
+        """Compare the instances of a stored chunk with those of the new one."""
         if u not in self._cues:
             here, there = self._instances(self._id), self._instances(u)
             self._cues[u] = compare_instances(there, here, self._settings.cues)
@@ -225,7 +225,7 @@ class RevisitSearch:
         return self._store.keyframes.get(c.u, c.frame_u), self._store.keyframes.get(self._id, c.frame_v)
 
     def by_things(self, found: Sequence[Edge]) -> list[Edge]:
-        """Return loop edges by the chunks' things alone, to what frames did not join to the new chunk."""
+        """Return loop edges by the chunks' instances alone, to chunks that no frame joins to the new one."""
         joined = {k for e in found if e.accepted for k in self._chains.connected_to(e.u)}
         revisits = [k for k, row in self._rows.items() if is_revisit(self._rows[self._id], row, self._settings.search)]
         apart = [k for k in revisits if self._apart(k) and k not in joined]
@@ -264,7 +264,7 @@ class RevisitSearch:
         return replace(edge, scores=edge.scores | off)
 
     def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
-        """Tell whether a single pair of frames is all that joins a chunk to the new one so far."""
+        """Return whether only a single pair of frames joins a chunk to the new one so far."""
         return self._apart(u) and len(accepted) == 1
 
     def alone(self, edges: Sequence[Edge]) -> Edge | None:
@@ -295,8 +295,8 @@ class RevisitSearch:
         return out
 
     def by_all_keyframes(self, edges: Sequence[Edge]) -> list[Edge]:
-        """Return the edges with those that all keyframes find to other sessions, where frames that look alike do not
-        place this one (research/sessions 0134). What they contradict is rejected, what they find again replaced."""
+        """Return the edges with those between all keyframes of this chunk and other sessions, where similar frames do
+        not place it (research/sessions 0134). Edges that they contradict are rejected, repeated ones replaced."""
         s, here, session = self._settings, self._rows[self._id], {k: r.session_id for k, r in self._rows.items()}
         others = [e for e in edges if session[e.u] != here.session_id and self._apart(e.u)]
         alike = sorted(others, key=lambda e: (not e.accepted, -e.scores.get("s_det", 0.0), e.u))
@@ -328,10 +328,10 @@ class RevisitSearch:
         return [f for f in self._store.keyframes.of(chunk_id) if _comparable(f)]
 
     def _contradicted(self, edge: Edge, found: Sequence[Edge]) -> Edge:
-        """Return an edge, rejected if it disagrees with the place that the whole of both chunks supports."""
+        """Return an edge, rejected if it disagrees with the place that all keyframes of both chunks support."""
         if not edge.accepted or not found or self._agree(found[0], edge):
             return edge
-        return _rejected(edge, "the whole of both chunks contradicts it")
+        return _rejected(edge, "all keyframes of both chunks contradict it")
 
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
         """Return the edges, with those rejected that join separate components in contradictory ways.
@@ -354,12 +354,12 @@ class RevisitSearch:
         return out
 
     def _agree(self, one: Edge, other: Edge) -> bool:
-        """Tell whether two relations of the new chunk can both be true; those to places apart from each other can."""
+        """Return whether two relations of the new chunk can both be true; to different components they always can."""
         chain = self._chains.predict(other.u, self._id, [one])
         return chain is None or chain.deviations(other.S_v_u) <= self._settings.chain.most_deviations
 
     def _apart(self, u: int) -> bool:
-        """Tell whether nothing joined a chunk to the new one before."""
+        """Return whether no edges joined a chunk to the new one before."""
         return u not in self._connected
 
     def _objection(self, cues: InstanceCues, chain: Prediction | None, S_v_u: Sim3) -> str | None:
@@ -389,7 +389,7 @@ class RevisitSearch:
         return self._sides[chunk_id]
 
     def _instances(self, chunk_id: int) -> InstanceSet:
-        """Return the instances of a chunk, read once while the store is open: a place is compared again and again."""
+        """Return the instances of a chunk, cached while the store is open: a place is compared again and again."""
         store, kept = self._store, self._store.derived.of(InstanceSets)
         key = (store.chunks.checksum(chunk_id), self._settings.cues)
         held = kept.get(chunk_id)

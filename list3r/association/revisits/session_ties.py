@@ -1,13 +1,12 @@
-"""Decide whether a session is placed in the world of another: by two relations that agree, or by one beyond doubt.
+"""Decide whether a session is placed in the world of another: by two relations that agree, or by a certain one.
 
-Two relations are of two pairs of chunks and four keyframes, or of one pair of chunks whose frames lie far apart, or one
-is by frames and one by things. One is beyond doubt when many features hold it, or when the whole of both chunks speaks
-for it (research/sessions 0134).
+Two relations must be of two pairs of chunks and four keyframes, or of one pair of chunks with frames far apart, or one
+by frames and one by instances. A relation is certain with many inlier features, or when all keyframes of both chunks
+support it (research/sessions 0134).
 
-Within one video neighbouring chunks share frames, and a false loop is caught by the chain. Nothing catches a false
-relation that alone ties one session to another: the whole session would land on top of the old world in a wrong place.
-Such a relation is held back, which is said in its reason, until another agrees with it or a later session connects the
-two (research/sessions 0049).
+Within one video neighbouring chunks share frames, and the chain exposes a false loop. Nothing exposes a false relation
+that alone joins two sessions: the whole session would be placed wrongly on top of the old world. Such a relation is
+deferred, with the reason, until another agrees with it or a later session connects the two (research/sessions 0049).
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
 HELD = "held"
-"""Score of a relation that is held back."""
+"""Score of a deferred relation."""
 
 
 @dataclass(frozen=True)
@@ -32,25 +31,25 @@ class TieSettings:
     """When relations place one session in the world of another."""
 
     agree_m: float = 0.3
-    """Two relations agree when they put what one of them sees within this of each other,"""
+    """Two relations agree when their positions of the chunks differ by at most this,"""
     agree_deg: float = 8.0
-    """turned by at most this,"""
+    """their rotations by at most this,"""
     agree_scale: float = 1.15
-    """and of scales in at most this ratio: what the chunks between them may have drifted."""
+    """and their scales by at most this ratio: the possible drift of the chunks between."""
     apart: FramesApart = field(default_factory=FramesApart)
-    """When relations of the same two chunks are two."""
+    """When relations of the same two chunks are independent."""
     sure_features: int = 60
-    """One relation is beyond doubt when this many features agree on it,"""
+    """One relation is certain when this many features agree on it,"""
     sure_overlap: float = 0.6
     """both sides see this share of the same surfaces,"""
     sure_agreement: float = 0.97
-    """and so much of that agrees."""
+    """and this share of them agrees."""
 
 
 def hold_back(
     edges: Sequence[Edge], session_of: Mapping[int, int], unit: float = 1.0, settings: TieSettings | None = None
 ) -> list[Edge]:
-    """Return edges, those between sessions that do not suffice to join them held back, and released where they do now.
+    """Return the edges; relations between sessions are deferred where they do not suffice, and released where they do.
 
     `session_of` gives the session of every chunk; `unit` is what a metre is in chunk units.
     """
@@ -77,7 +76,7 @@ def hold_back(
 
 
 class _Blocks:
-    """Chunks that are placed to each other: the frame they share, and their poses in it."""
+    """Components of chunks: the frame that each shares, and the chunks' poses in it."""
 
     def __init__(self, poses: dict[int, Sim3], block: dict[int, int], session_of: Mapping[int, int]) -> None:
         self.poses, self.block, self.session_of = poses, block, session_of
@@ -96,7 +95,7 @@ class _Blocks:
 
 
 def _by_block(ties: Sequence[int], edges: Sequence[Edge], blocks: _Blocks) -> dict[tuple[int, int], list[int]]:
-    """Return the ties of each two blocks that are not one yet, in order."""
+    """Return the relations between each two blocks that are not joined yet, in order."""
     out: dict[tuple[int, int], list[int]] = {}
     for k in ties:
         a, b = sorted((blocks.block[edges[k].u], blocks.block[edges[k].v]))
@@ -116,7 +115,7 @@ def _best(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -
 
 
 def _agreeing(found: Sequence[Edge], blocks: _Blocks, unit: float, s: TieSettings) -> list[int]:
-    """Return with how many relations of other chunks, or of other frames of its own chunks, each agrees; itself too."""
+    """Return the number of independent relations that each agrees with, itself included."""
     others = [[f for f in found if are_two(e, f, blocks.session_of, s.apart)] for e in found]
     return [
         1 + len({(f.u, f.v) for f in rest if _agree(e, f, blocks, unit, s)})

@@ -1,5 +1,5 @@
-"""Maps of parts of one video joined where they see the same: a camera that turns on the spot carries no scale along,
-and what is mapped falls apart there.
+"""Join maps of parts of one video where they overlap: a camera that rotates in place passes no scale on, and the map
+breaks there.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Side:
-    """A map, and what each of its keyframes sees of it."""
+    """A map, and the points that each of its keyframes sees."""
 
     found: SparseMap
     points_cam: dict[int, Array]
-    """All corners and features of a keyframe in its camera coordinates, NaN where the map does not hold them, by key.
-    Shape (N, 3)."""
+    """All corners and features of a keyframe in its camera coordinates, NaN where the map has none, by key. Shape
+    (N, 3)."""
 
 
 def join_maps(
@@ -63,7 +63,7 @@ def _side(found: SparseMap, problem: MapProblem) -> _Side:
 
 
 def seen_points(found: SparseMap, view: KeyframeView, key: int) -> Array:
-    """All that a keyframe sees, in its camera coordinates, NaN where the map does not hold it. Shape (N, 3)."""
+    """All that a keyframe sees, in its camera coordinates, NaN where the map has no point. Shape (N, 3)."""
     T, held = found.T_map_cam[key], set(found.seen[key].ids.tolist())
     nowhere = np.full(3, np.nan)
     places = np.array([found.points[n] if n in held else nowhere for n in view.ids.tolist()]).reshape(-1, 3)
@@ -73,7 +73,7 @@ def seen_points(found: SparseMap, view: KeyframeView, key: int) -> Array:
 def _candidates(
     a: Sequence[int], b: Sequence[int], looks: Mapping[int, NDArray[np.float32]], how: JoiningSettings
 ) -> list[tuple[int, int]]:
-    """Keyframes of the two maps, by key, that may see the same; a keyframe that both hold sees what it sees."""
+    """Keyframes of the two maps, by key, that may overlap; one that both maps hold is paired with itself."""
     cosine = np.stack([looks[n] for n in b]) @ np.stack([looks[m] for m in a]).T
     place = {key: k for k, key in enumerate(sorted({*a, *b}))}
     out: set[tuple[int, int]] = set()
@@ -88,7 +88,7 @@ class _Pair:
     a: int
     b: int
     rows: NDArray[np.int64]
-    """Rows of the two keyframes that show the same. Shape (M, 2)."""
+    """Matching rows of the two keyframes. Shape (M, 2)."""
 
 
 def _rows(pair: tuple[int, int], problem: MapProblem, features: Mapping[int, LocalFeatures]) -> _Pair:
@@ -133,7 +133,7 @@ def _relation_of_maps(
 
 
 def _agree(one: Sim3, other: Sim3, T_b: Sim3, depth: float, how: JoiningSettings) -> bool:
-    """Tell whether two relations S_a_b put a view of b, which sees so deep, at the same place."""
+    """Return whether two relations S_a_b place a view of b, at a typical depth, equally."""
     off = ((one @ T_b).inverse() @ other @ T_b).log()
     near = np.linalg.norm(off[:3]) < how.shift * depth and np.linalg.norm(off[3:6]) < how.turn_rad
     return bool(near and abs(off[6]) < how.log_scale)

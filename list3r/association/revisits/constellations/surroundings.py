@@ -1,7 +1,7 @@
-"""Gather what surrounds a chunk: it and its neighbours in time, laid in its frame as if they were one chunk.
+"""Merge a chunk and its neighbours in time, in its frame, as if they were one chunk.
 
-A single chunk holds few things, most of them seen from one side, and in a symmetric room they fit the wrong way round
-as well. Its neighbours add things that do not fit there, and other sides of those that do (research/association 0147).
+A single chunk has few instances, most of them seen from one side, and in a symmetric room they also fit the wrong way
+round. Its neighbours add instances that do not fit there, and other sides of the rest (research/association 0147).
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class SurroundingsSettings:
-    """What belongs to the surroundings of a chunk, and which things of two chunks are one."""
+    """The neighbourhood of a chunk, and which instances of two chunks are one object."""
 
     chunks: int = 5
-    """Most chunks, itself among them; 1 takes it alone."""
+    """Most chunks, itself included; 1 takes it alone."""
     steps: int = 4
-    """Most edges between neighbours in time from it to another one."""
+    """Most edges between neighbours in time to another chunk."""
     near: float = 1.5
-    """Largest distance between the middles of two chunks, share of the typical depth."""
+    """Largest distance between the centres of two chunks, share of the typical depth."""
     apart: float = 0.5
-    """Largest distance between the middles of one thing in two chunks, share of its smaller diagonal."""
+    """Largest distance between the centres of one object in two chunks, share of its smaller diagonal."""
     log_size: float = 0.9
     """Largest difference of the logarithms of its diagonals."""
     trim: float = 0.06
     """Share of the support points left outside at either end of each axis of a box."""
     most_instances: int = 120
-    """Things of all chunks together, those seen in most frames."""
+    """Instances of all chunks together, those seen in most frames."""
 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """One chunk of the surroundings of another."""
+    """One chunk of the neighbourhood of another."""
 
     S_here_chunk: Sim3
-    """To the frame of the chunk in the middle."""
+    """To the frame of the central chunk."""
     nodes: Sequence[LocalNode]
     side: Side
 
@@ -57,8 +57,8 @@ def gather(
 ) -> tuple[list[LocalNode], Side]:
     """Return the instances and the samples of several chunks in the frame of the first one.
 
-    Frames and local ids are numbered again; things of two chunks that stand in one place are one. `space` is the
-    embedding space of the features.
+    Frames and local ids are renumbered; instances of two chunks at one position are merged. `space` is the embedding
+    space of the features.
     """
     s = settings or SurroundingsSettings()
     first = parts[0].side
@@ -119,7 +119,7 @@ def _joined(parts: Sequence[FrameSamples]) -> FrameSamples:
 def _merged(
     known: list[LocalNode], fresh: Sequence[LocalNode], one: dict[int, int], s: SurroundingsSettings
 ) -> list[LocalNode]:
-    """Return the known things with fresh ones, those that stand in one place as one; `one` tells their ids."""
+    """Return the known instances with the fresh ones, merged where they are one object; `one` receives their ids."""
     out = list(known)
     at = {int(j): int(i) for i, j in _same_things(known, fresh, s)}
     for j, node in enumerate(fresh):
@@ -132,7 +132,7 @@ def _merged(
 
 
 def _same_things(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: SurroundingsSettings) -> Ints:
-    """Return rows of the two that are one thing, each at most once, nearest first. Shape (P, 2)."""
+    """Return rows of the two that are one object, each at most once, nearest first. Shape (P, 2)."""
     rows_u, rows_v = ([k for k, n in enumerate(nodes) if _stands(n)] for nodes in (known, fresh))
     if not rows_u or not rows_v:
         return np.zeros((0, 2), np.int64)
@@ -160,14 +160,14 @@ def _stands(node: LocalNode) -> bool:
 
 
 def _boxes(nodes: Sequence[LocalNode], trim: float) -> tuple[Array, Array]:
-    """Return middles (N, 3) and diagonals (N,) of boxes along the axes, without the outermost points."""
+    """Return centres (N, 3) and diagonals (N,) of axis-aligned boxes, without the outermost points."""
     low_high = np.array([np.quantile(n.support.points, [trim, 1 - trim], axis=0) for n in nodes]).reshape(-1, 2, 3)
     size = np.linalg.norm(low_high[:, 1] - low_high[:, 0], axis=1)
     return low_high.mean(axis=1), np.maximum(size, 1e-9)
 
 
 def _both(a: LocalNode, b: LocalNode) -> LocalNode:
-    """Return two sightings of one thing as one; its look is the mean over all frames."""
+    """Merge two local instances of one object; the feature is the mean over all frames."""
     feature = a.feature
     if a.feature.shape == b.feature.shape:
         mean = a.feature * len(a.frames) + b.feature * len(b.frames)
