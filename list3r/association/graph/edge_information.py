@@ -26,10 +26,10 @@ class WeightSettings:
     lever_m: float = 1.0
     """Distance at which a rotation weighs as much as a shift where an edge has no lever, metres; without metric scale
     half the spread of its points replaces it."""
-    bend: float = 0.006
+    bending: float = 0.006
     """Standard deviation of a chunk's shape between the supports of two edges, as a share of the support's radius for
     shifts, in radians for rotations, and of the log scale: a prior that loops correct."""
-    own_bend: float = 0.013
+    own_bending: float = 0.013
     """Standard deviation of a chunk's frame, as its edges see it, from its own cameras, in the units of `bending`. It
     does not weight edges: it is part of a chunk's stated covariance, once for the chunk and once for the first chunk
     of the component. Chosen on four simulated videos (seed 101)."""
@@ -48,7 +48,9 @@ def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings
     covariance = np.empty((len(edges), 7, 7))
     measured = np.array([e.covariance is not None for e in edges], bool)
     if measured.any():
-        covariance[measured] = _bent(np.array([e.covariance for e in edges if e.covariance is not None]), settings)
+        covariance[measured] = _with_bending(
+            np.array([e.covariance for e in edges if e.covariance is not None]), settings
+        )
     for k in np.flatnonzero(~measured).tolist():
         covariance[k] = _unmeasured(edges[k], metric, settings)
     inverse = np.linalg.inv(covariance[:, :size, :size])
@@ -65,13 +67,13 @@ def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settin
     out, seen = np.zeros((count, 7, 7)), np.zeros(count)
     if stated:
         covariance = np.array([e.covariance for e in stated])
-        shape = _bent(covariance, settings) - covariance
+        shape = _with_bending(covariance, settings) - covariance
         moved = adjoint(stack([e.S_v_u for e in stated]))
         rows = np.array([[row[e.u], row[e.v]] for e in stated])
         np.add.at(out, rows[:, 0], shape)
         np.add.at(out, rows[:, 1], moved @ shape @ np.swapaxes(moved, 1, 2))
         np.add.at(seen, rows, 1)
-    return np.asarray(out * (settings.own_bend / settings.bend) ** 2 / np.maximum(seen, 1)[:, None, None])
+    return np.asarray(out * (settings.own_bending / settings.bending) ** 2 / np.maximum(seen, 1)[:, None, None])
 
 
 def lever_of(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
@@ -86,15 +88,15 @@ def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
     lever = lever_of(edge, metric, settings) or settings.lever_m
     deviation = settings.unmeasured / np.sqrt(max(edge.confidence, settings.least_confidence))
     unit = np.array([lever] * 3 + [1.0] * 4)
-    return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bend**2)))
+    return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bending**2)))
 
 
-def _bent(covariance: Array, settings: WeightSettings) -> Array:
+def _with_bending(covariance: Array, settings: WeightSettings) -> Array:
     """Return covariances with deformation about the centre of each edge's support. Shape (E, 7, 7)."""
     center, radius = support_of(covariance)
     shape = about(center)
     shape[:, :, :3] *= radius[:, None, None]
-    return np.asarray(covariance + settings.bend**2 * shape @ np.swapaxes(shape, 1, 2))
+    return np.asarray(covariance + settings.bending**2 * shape @ np.swapaxes(shape, 1, 2))
 
 
 def about(center: Array) -> Array:

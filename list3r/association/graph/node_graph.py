@@ -34,7 +34,7 @@ from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
 
-_NOTHING = 1e9
+_UNTRUSTED = 1e9
 """Variance factor of outlier edges, so that components that only they join stay in place."""
 _STEPS = 10
 """Most steps of the solution; its start is near."""
@@ -86,7 +86,7 @@ def bend_chunks(
     start = [graph.S_graph_chunk[c] for c, nodes in pieces.nodes.items() for _ in nodes.at]
     problem = _problem(pieces, believed, graph.components, metric, chosen, weights or GraphSettings(), turning)
     placed = problem.solve(stack(start), np.ones(len(problem.u)), _STEPS)
-    return _settled(placed, pieces.nodes, graph, rigid)
+    return _place_chunks(placed, pieces.nodes, graph, rigid)
 
 
 def pieces_of(
@@ -127,8 +127,8 @@ def _problem(
     walk = np.maximum(walk + np.array([settings.shift_walk, settings.turn_walk, 0.0]) ** 2, settings.least_walk**2)
     for chunk, nodes in pieces.nodes.items():
         for k in range(len(nodes.at) - 1):
-            bent = walk_covariance(nodes, k, walk) + (nodes.turns[k] if chunk in turning else 0.0)
-            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), bent)
+            deformation = walk_covariance(nodes, k, walk) + (nodes.turns[k] if chunk in turning else 0.0)
+            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), deformation)
     tied = set()
     for edge, relations in pieces.relations:
         relations = relations.rigid() if metric else relations
@@ -147,8 +147,8 @@ def _problem(
         add(first[edge.u] + tie.u, first[edge.v] + tie.v, tie.S_v_u, tie.covariance)
     if rest:
         factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
-        factors[[not e.accepted for e in rest]] *= _NOTHING
-        stiff = replace(weights.weights, bend=0.0)  # the nodes bend instead
+        factors[[not e.accepted for e in rest]] *= _UNTRUSTED
+        stiff = replace(weights.weights, bending=0.0)  # the nodes bend instead
         information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
     fixed = np.zeros(pieces.count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True
@@ -165,7 +165,7 @@ def _whole(edge: Edge, nodes: Mapping[int, ChunkNodes]) -> Tie:
     return Tie(len(u.at) - 1, 0, edge.S_v_u, np.eye(7))
 
 
-def _settled(
+def _place_chunks(
     placed: Sim3,
     nodes: Mapping[int, ChunkNodes],
     graph: GraphResult,

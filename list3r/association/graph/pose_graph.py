@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.association.graph.edge_information import WeightSettings, information_of, own_shapes
-from list3r.association.graph.loop_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
+from list3r.association.graph.edge_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
 from list3r.association.graph.marginals import widening
 from list3r.association.graph.solver import GraphProblem, adjoint, unstack
 from list3r.memory.errors import DegenerateError
@@ -90,7 +90,7 @@ def optimize(
     weights = np.delete(weights, weak, axis=0)
     for n in reversed(weak):
         scores = {**active[n].scores, "trust": 0.0}
-        reason = f"too uncertain beside the other edges{_ALONE}{active[n].reason})"
+        reason = f"too uncertain compared with the other edges{_ALONE}{active[n].reason})"
         reason = active[n].reason if "trust" in active[n].scores and not active[n].accepted else reason
         out[used[n]] = replace(active[n], weight=0.0, accepted=False, scores=scores, reason=reason)
         del used[n], active[n]

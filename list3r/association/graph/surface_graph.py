@@ -80,7 +80,7 @@ def place_by_surfaces(
         np.array([graph.components[chunk] == chunk for chunk in ids]),
     )
     placed = unstack(problem.solve(stack([known[k] for k in ids]), np.ones(len(ties)), _STEPS), ids)
-    return replace(graph, S_graph_chunk=placed), _beside(placed, graph, bends)
+    return replace(graph, S_graph_chunk=placed), _camera_corrections(placed, graph, bends)
 
 
 def _bending(nodes: ChunkNodes, s: SurfaceSettings) -> Array:
@@ -99,7 +99,7 @@ def _sharper(edge: Edge, s: SurfaceSettings) -> Array:
     return np.asarray(edge.covariance * np.outer(factor, factor))
 
 
-def _beside(placed: Mapping[int, Sim3], graph: GraphResult, bends: Mapping[int, Bend]) -> dict[int, Bend]:
+def _camera_corrections(placed: Mapping[int, Sim3], graph: GraphResult, bends: Mapping[int, Bend]) -> dict[int, Bend]:
     """Return corrections that take each frame to its pose in the cameras' graph, after the chunks' mean motion."""
     out: dict[int, Bend] = {}
     for component in sorted(set(graph.components.values())):

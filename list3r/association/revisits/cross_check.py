@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.revisits.cues import InstanceSet
+from list3r.association.revisits.instance_similarity import InstanceSet
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples
@@ -96,8 +96,8 @@ def cross_check(
     """Test a relation. Pairs of `made_from`, the frames of u and of v that it was estimated from, prove nothing."""
     chosen = settings or CrossSettings()
     known = made_from or (np.zeros(0, np.int64), np.zeros(0, np.int64))
-    there = _look(S_v_u, u, v, known[0], known[1], chosen)
-    back = _look(S_v_u.inverse(), v, u, known[1], known[0], chosen)
+    there = _compare(S_v_u, u, v, known[0], known[1], chosen)
+    back = _compare(S_v_u.inverse(), v, u, known[1], known[0], chosen)
     likeness, kinds = _kinds(u.instances, v.instances, np.concatenate([there.landed, back.landed[:, ::-1]]), chosen)
     return CrossCheck(
         overlap=max(there.overlap, back.overlap),
@@ -161,7 +161,7 @@ def _unit(vectors: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Comparison:
     """Comparison of a source's points with a target."""
 
     overlap: float
@@ -188,13 +188,15 @@ class _Grids:
     """Frame.index. Shape (G,)."""
 
 
-def _look(S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: Ints, settings: CrossSettings) -> _Look:
+def _compare(
+    S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: Ints, settings: CrossSettings
+) -> _Comparison:
     """Compare points of the source, moved by S, with the frames of the target; pairs of frames that are both skipped
     are left out."""
     points, frame, instance = _points(source, settings)
     grids = _grids(target, settings)
     if not len(points) or not len(grids.frames):
-        return _Look(0.0, 1.0, np.zeros((0, 2), np.int64))
+        return _Comparison(0.0, 1.0, np.zeros((0, 2), np.int64))
     there = S.apply(points)
     agree, through, label = _verdicts(there, grids, target.camera, settings)
     both = np.isin(frame, skip_source)[:, None] & np.isin(grids.frames, skip_target)[None]
@@ -206,7 +208,7 @@ def _look(S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: I
     hit = share >= 0.5
     pairs = np.stack([instance[judged & hit], landed[judged & hit]], axis=1)
     agreement = float(share[judged].mean()) if judged.any() else 1.0
-    return _Look(float((judged & hit).mean()), agreement, pairs.astype(np.int64))
+    return _Comparison(float((judged & hit).mean()), agreement, pairs.astype(np.int64))
 
 
 def _usable(side: Side, settings: CrossSettings) -> Mask:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.association.graph.solver import adjoint
 from list3r.association.overlap.alignment import align
-from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, measure_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, measure_edge
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.association.revisits.cross_check import CrossSettings, Side, cross_check, shared_view
 from list3r.memory.errors import DegenerateError

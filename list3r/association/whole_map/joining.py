@@ -39,7 +39,7 @@ def join_maps(
     settings: tuple[JoiningSettings, RevisitPairSettings],
 ) -> SparseMap:
     """Return the largest map with those that can be joined to it, one after another; they may share keyframes."""
-    looks = {k: describe_rooted(f.descriptors) for k, f in features.items()}
+    descriptors = {k: describe_rooted(f.descriptors) for k, f in features.items()}
     left = list(maps[1:])
     whole = maps[0]
     joined = True
@@ -50,7 +50,7 @@ def join_maps(
                 left.remove(other)
                 continue
             a, b = _side(whole, problem), _side(other, problem)
-            pairs = _candidates(list(a.points_cam), list(b.points_cam), looks, settings[0])
+            pairs = _candidates(list(a.points_cam), list(b.points_cam), descriptors, settings[0])
             S = _relation_of_maps(a, b, [_rows(p, problem, features) for p in pairs], problem, camera, settings)
             if S is not None:
                 whole, joined = _merged(whole, other, S), True
@@ -71,10 +71,10 @@ def seen_points(found: SparseMap, view: KeyframeView, key: int) -> Array:
 
 
 def _candidates(
-    a: Sequence[int], b: Sequence[int], looks: Mapping[int, NDArray[np.float32]], how: JoiningSettings
+    a: Sequence[int], b: Sequence[int], descriptors: Mapping[int, NDArray[np.float32]], how: JoiningSettings
 ) -> list[tuple[int, int]]:
     """Keyframes of the two maps, by key, that may overlap; one that both maps hold is paired with itself."""
-    cosine = np.stack([looks[n] for n in b]) @ np.stack([looks[m] for m in a]).T
+    cosine = np.stack([descriptors[n] for n in b]) @ np.stack([descriptors[m] for m in a]).T
     place = {key: k for k, key in enumerate(sorted({*a, *b}))}
     out: set[tuple[int, int]] = set()
     for row, n in zip(cosine, b, strict=True):
@@ -120,7 +120,7 @@ def _relation_of_maps(
         measured = relation(
             a.points_cam[pair.a][at_a], problem.views[pair.b].xy[at_b], points_b[at_b], camera, settings[1]
         )
-        if measured is not None and measured.tells_scale:
+        if measured is not None and measured.least_scale_points:
             T_a, T_b = (Sim3.from_matrix(m.found.T_map_cam[k]) for m, k in ((a, pair.a), (b, pair.b)))
             found.append((T_a @ measured.S_b_a.inverse() @ T_b.inverse(), T_b, float(np.nanmedian(points_b[:, 2]))))
     votes = [sum(_agree(S, other, T_b, depth, how) for other, _, _ in found) for S, T_b, depth in found]

@@ -38,8 +38,8 @@ def candidate_pairs(views: Sequence[MapView], camera: Camera, settings: RevisitP
     forward = np.stack([v.T_map_cam[:3, 2] for v in views])
     turned = forward @ forward.T > np.cos(np.deg2rad(settings.most_turn_deg))
     share = np.where(apart & turned, shared_views(views, camera), 0.0)
-    looks = np.stack([v.look for v in views]).astype(np.float64)
-    cosine = np.where(apart, looks @ looks.T, -1.0)
+    descriptors = np.stack([v.descriptor for v in views]).astype(np.float64)
+    cosine = np.where(apart, descriptors @ descriptors.T, -1.0)
     found: set[Pair] = set()
     for k in range(count):
         best = np.argsort(-share[k], kind="stable")[: settings.partners]
@@ -85,7 +85,7 @@ class ViewRelation:
     """From a's camera to b's, the scale from points of both maps; 1 where these are too few."""
     inliers: int
     """Features that agree."""
-    tells_scale: bool
+    least_scale_points: bool
 
 
 def relation(
@@ -103,9 +103,9 @@ def relation(
     there = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
     own = points_b[:, 2]
     both = agree & np.isfinite(own) & (own > 0) & (there[:, 2] > 0)
-    tells = bool(both.sum() >= settings.tells_scale)
-    scale = float(np.exp(np.median(np.log(own[both] / there[both, 2])))) if tells else 1.0
-    return ViewRelation(Sim3(np.asarray(scale), T_b_a[:3, :3], scale * T_b_a[:3, 3]), int(agree.sum()), tells)
+    enough = bool(both.sum() >= settings.least_scale_points)
+    scale = float(np.exp(np.median(np.log(own[both] / there[both, 2])))) if enough else 1.0
+    return ViewRelation(Sim3(np.asarray(scale), T_b_a[:3, :3], scale * T_b_a[:3, 3]), int(agree.sum()), enough)
 
 
 def _fits(S_b_a: Sim3, a: MapView, b: MapView, between: tuple[int, float], s: RevisitPairSettings) -> bool:

@@ -26,7 +26,7 @@ class RevisitPairSettings:
     """A revisit counts as a loop where the camera in between saw no more than this share of the place."""
     least_matches: int = 20
     """Fewest features that two have in common."""
-    tells_scale: int = 8
+    least_scale_points: int = 8
     """Fewest common points that determine the scale."""
     shift: tuple[float, float] = (0.15, 0.04)
     """Largest drift at a revisit: share of the depth, and share of the path between."""

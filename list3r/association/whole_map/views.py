@@ -24,7 +24,7 @@ class MapView:
     T_map_cam: Array
     """Shape (4, 4)."""
     features: LocalFeatures
-    look: NDArray[np.float32]
+    descriptor: NDArray[np.float32]
     """Unit descriptor of the whole frame. Shape (D,)."""
     points_cam: Array
     """Features in camera coordinates, map units, NaN where the map has no point. Shape (N, 3)."""

@@ -29,9 +29,9 @@ class SurfaceFitSettings:
     """Steps of each round."""
     least_cosine: float = 0.75
     """Least cosine between the normals, up to sign, of corresponding points."""
-    anchor: float = 0.08
+    instance_sigma: float = 0.08
     """Standard deviation of an instance's centre, which constrains the directions that surfaces leave open."""
-    anchor_weight: float = 0.05
+    instance_weight: float = 0.05
     """Weight of all instances against all surfaces."""
     upright: float = 0.065
     """Weight of both chunks' estimates of up, which are accurate to a degree or two,"""
@@ -175,11 +175,13 @@ class _Fit:
         arm = p - middle
         J = np.concatenate([n, np.cross(arm, n), np.einsum("ni,ni->n", arm, n)[:, None]], axis=1)
         A, b = (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r
-        things = S.apply(held.middle_u)
-        arm = things - middle
-        J_a = np.concatenate([np.tile(np.eye(3), (len(things), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
-        off = held.middle_v - things
-        weight_a = s.anchor_weight / (1 + (np.linalg.norm(off, axis=1) / (s.anchor * v.unit)) ** 2) / len(things)
+        centers = S.apply(held.middle_u)
+        arm = centers - middle
+        J_a = np.concatenate([np.tile(np.eye(3), (len(centers), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
+        off = held.middle_v - centers
+        weight_a = (
+            s.instance_weight / (1 + (np.linalg.norm(off, axis=1) / (s.instance_sigma * v.unit)) ** 2) / len(centers)
+        )
         A += np.einsum("p,pki,pkj->ij", weight_a, J_a, J_a)
         b += np.einsum("p,pki,pk->i", weight_a, J_a, off)
         lean = s.upright * v.unit**2

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.cross_check import Side
-from list3r.association.revisits.cues import CueSettings, instance_set
+from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples, Support
 from list3r.memory.store.tables.local_instances import LocalNode
@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class SurroundingsSettings:
+class NeighbourhoodSettings:
     """The neighbourhood of a chunk, and which instances of two chunks are one object."""
 
     chunks: int = 5
@@ -53,14 +53,14 @@ class Neighbour:
 
 
 def gather(
-    parts: Sequence[Neighbour], space: str, settings: SurroundingsSettings | None = None
+    parts: Sequence[Neighbour], space: str, settings: NeighbourhoodSettings | None = None
 ) -> tuple[list[LocalNode], Side]:
     """Return the instances and the samples of several chunks in the frame of the first one.
 
     Frames and local ids are renumbered; instances of two chunks at one position are merged. `space` is the embedding
     space of the features.
     """
-    s = settings or SurroundingsSettings()
+    s = settings or NeighbourhoodSettings()
     first = parts[0].side
     if len(parts) == 1:
         return list(parts[0].nodes), first
@@ -79,8 +79,8 @@ def gather(
     instance = np.where(together.instance >= 0, known[together.instance], -1).astype(np.int32)
     moving = frozenset(int(known[i + k * step_id]) for k, p in enumerate(parts) for i in p.side.moving)
     whole = replace(together, instance=instance)
-    cues = replace(CueSettings(), most_instances=s.most_instances)
-    return nodes, Side(whole, first.camera, instance_set(nodes, whole.T_chunk_cam, space, cues), moving)
+    similarity = replace(SimilaritySettings(), most_instances=s.most_instances)
+    return nodes, Side(whole, first.camera, instance_set(nodes, whole.T_chunk_cam, space, similarity), moving)
 
 
 def _moved_node(node: LocalNode, S: Sim3, frames: int, ids: int) -> LocalNode:
@@ -117,11 +117,11 @@ def _joined(parts: Sequence[FrameSamples]) -> FrameSamples:
 
 
 def _merged(
-    known: list[LocalNode], fresh: Sequence[LocalNode], one: dict[int, int], s: SurroundingsSettings
+    known: list[LocalNode], fresh: Sequence[LocalNode], one: dict[int, int], s: NeighbourhoodSettings
 ) -> list[LocalNode]:
     """Return the known instances with the fresh ones, merged where they are one object; `one` receives their ids."""
     out = list(known)
-    at = {int(j): int(i) for i, j in _same_things(known, fresh, s)}
+    at = {int(j): int(i) for i, j in _matches(known, fresh, s)}
     for j, node in enumerate(fresh):
         if j in at:
             one[node.local_id] = out[at[j]].local_id
@@ -131,9 +131,9 @@ def _merged(
     return out
 
 
-def _same_things(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: SurroundingsSettings) -> Ints:
+def _matches(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: NeighbourhoodSettings) -> Ints:
     """Return rows of the two that are one object, each at most once, nearest first. Shape (P, 2)."""
-    rows_u, rows_v = ([k for k, n in enumerate(nodes) if _stands(n)] for nodes in (known, fresh))
+    rows_u, rows_v = ([k for k, n in enumerate(nodes) if _is_static(n)] for nodes in (known, fresh))
     if not rows_u or not rows_v:
         return np.zeros((0, 2), np.int64)
     (center_u, size_u), (center_v, size_v) = (
@@ -154,7 +154,7 @@ def _same_things(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: Surr
     return np.array(out, np.int64).reshape(-1, 2)
 
 
-def _stands(node: LocalNode) -> bool:
+def _is_static(node: LocalNode) -> bool:
     points = node.support.points
     return not node.structure and not node.dynamic and len(points) > 0 and bool(np.isfinite(points).all())
 

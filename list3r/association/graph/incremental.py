@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra
 
 from list3r.association.graph.edge_information import information_of
-from list3r.association.graph.loop_trust import NO_TRUST
+from list3r.association.graph.edge_trust import NO_TRUST
 from list3r.association.graph.pose_graph import (
     GraphResult,
     GraphSettings,

@@ -32,7 +32,7 @@ class FramesApart:
         return min(gaps) >= self.each and sum(gaps) >= self.both
 
 
-def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
+def are_independent(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
     """Return whether two relations of two sessions support each other.
 
     Two of one pair of chunks do where their frames are apart, or where one is by frames and the other by instances.
@@ -48,7 +48,7 @@ def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart)
 
 
 @dataclass(frozen=True)
-class SecondLookSettings:
+class FurtherPairSettings:
     """Which further pairs of keyframes are compared."""
 
     most: int = 64
@@ -61,11 +61,11 @@ class SecondLookSettings:
     """and a distance of one median depth of the chunk counts as much as this whole angle."""
 
 
-def seeing_the_same(
+def similar_views(
     edge: Edge,
     samples: tuple[FrameSamples, FrameSamples],
     keyframes: tuple[Sequence[int], Sequence[int]],
-    settings: SecondLookSettings,
+    settings: FurtherPairSettings,
 ) -> list[tuple[int, int]]:
     """Return pairs of keyframes (Frame.index) with similar views under an edge, the most similar first.
 

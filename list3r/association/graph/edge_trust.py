@@ -26,7 +26,7 @@ NO_TRUST = 1e-9
 """Weight of rejected edges, so that components that only they join stay in place."""
 
 
-_SETTLED = 0.05
+_FACTORS_CONVERGED = 0.05
 """Change of the log of a variance factor below which the factors have converged."""
 
 _ROUGHLY, _CLOSELY = 1e-3, 1e-9
@@ -105,7 +105,7 @@ def solve_with_trust(
         known, squares = marginals(scaled, poses, np.maximum(trust, NO_TRUST)), scaled.squares(poses)
         before = factors
         factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, before, settings.prior_freedom)
-        if np.abs(np.log(factors / before)).max() < _SETTLED:
+        if np.abs(np.log(factors / before)).max() < _FACTORS_CONVERGED:
             break
     scaled = problem.scaled(factors[kinds])
     known = marginals(scaled, poses, np.maximum(trust, NO_TRUST))
@@ -149,8 +149,8 @@ def _first(
     within = ~loop
     within[loop] = chain_squares(problem, start, tree, loop) <= limit[loop]
     found = []
-    held = np.where(loop, limit, np.inf)
-    for first, kernel in ((ones, limit), (ones, held), (within.astype(np.float64), limit)):
+    kept = np.where(loop, limit, np.inf)
+    for first, kernel in ((ones, limit), (ones, kept), (within.astype(np.float64), limit)):
         poses = start if first.all() else problem.solve(start, np.maximum(first, NO_TRUST), settings.iterations)
         poses, _ = _anneal(problem, poses, kernel, settings, gated=not first.all())
         poses, trust = _harden(problem, poses, limit, True, settings)

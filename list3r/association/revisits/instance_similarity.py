@@ -23,14 +23,14 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class CueSettings:
+class SimilaritySettings:
     """How instances of two chunks are compared."""
 
     least_cosine: float = 0.5
     """Least cosine of two features for their instances to be candidates for one object."""
     candidates: int = 3
     """Most candidates for an instance."""
-    look_alike: float = 0.08
+    cosine_margin: float = 0.08
     """Candidates within this of the best cosine are kept as well."""
     most_instances: int = 40
     """Instances compared of a chunk, those seen in most frames first."""
@@ -62,7 +62,7 @@ class InstanceSet:
 
 
 @dataclass(frozen=True)
-class InstanceCues:
+class InstanceSimilarity:
     """Agreement of the instances of two chunks."""
 
     s_sem: float
@@ -75,11 +75,11 @@ class InstanceCues:
     """Log of v's units over u's by the layout, NaN where there is none."""
 
 
-NO_CUES = InstanceCues(0.0, 0.0, (), float("nan"))
+NO_SIMILARITY = InstanceSimilarity(0.0, 0.0, (), float("nan"))
 
 
 def instance_set(
-    nodes: Sequence[LocalNode], T_chunk_cam: NDArray[np.float64], space: str, settings: CueSettings
+    nodes: Sequence[LocalNode], T_chunk_cam: NDArray[np.float64], space: str, settings: SimilaritySettings
 ) -> InstanceSet:
     """Return the instances of a chunk from its local nodes and the poses (G, 4, 4) of its cameras.
 
@@ -107,43 +107,43 @@ def _sound(node: LocalNode) -> bool:
     return len(points) > 0 and bool(np.isfinite(feature).all() and np.isfinite(points).all() and feature.any())
 
 
-def compare_instances(u: InstanceSet, v: InstanceSet, settings: CueSettings | None = None) -> InstanceCues:
+def compare_instances(u: InstanceSet, v: InstanceSet, settings: SimilaritySettings | None = None) -> InstanceSimilarity:
     """Compare the instances of two chunks. Features of two spaces cannot be compared and give no similarity."""
-    chosen = settings or CueSettings()
+    chosen = settings or SimilaritySettings()
     if u.space != v.space or not len(u.local_id) or not len(v.local_id) or u.feature.shape[1] != v.feature.shape[1]:
-        return NO_CUES
+        return NO_SIMILARITY
     cosine = u.feature @ v.feature.T
     mutual = _mutual(cosine, chosen)
     s_sem = float(np.clip(cosine[mutual[:, 0], mutual[:, 1]].mean(), 0.0, 1.0)) if len(mutual) else 0.0
     layout, s_rel, log_scale = _layout(u, v, cosine, chosen)
     kept = layout if len(layout) else mutual
     pairs = tuple((int(u.local_id[i]), int(v.local_id[j])) for i, j in kept)
-    return InstanceCues(s_sem, s_rel, pairs, log_scale)
+    return InstanceSimilarity(s_sem, s_rel, pairs, log_scale)
 
 
-def loop_score(s_det: float, cues: InstanceCues, weight: float) -> float:
+def loop_score(s_det: float, similarity: InstanceSimilarity, weight: float) -> float:
     """Return s_loop of the paper, (0 to 2): weight * s_det + (1 - weight) * (s_sem + s_rel)."""
-    return weight * s_det + (1.0 - weight) * (cues.s_sem + cues.s_rel)
+    return weight * s_det + (1.0 - weight) * (similarity.s_sem + similarity.s_rel)
 
 
-def _mutual(cosine: Array, settings: CueSettings) -> Ints:
+def _mutual(cosine: Array, settings: SimilaritySettings) -> Ints:
     """Return the mutual nearest neighbours. Shape (P, 2)."""
     forth, back = cosine.argmax(axis=1), cosine.argmax(axis=0)
     rows = np.flatnonzero((back[forth] == np.arange(len(cosine))) & (cosine.max(axis=1) >= settings.least_cosine))
     return np.stack([rows, forth[rows]], axis=1)
 
 
-def _candidates(cosine: Array, settings: CueSettings) -> Ints:
+def _candidates(cosine: Array, settings: SimilaritySettings) -> Ints:
     """Return pairs of instances that may be one object: near the best of either side. Shape (M, 2)."""
     out = np.zeros(cosine.shape, bool)
     for axis in (0, 1):
         best = cosine.max(axis=axis, keepdims=True)
         rank = np.argsort(np.argsort(-cosine, axis=axis, kind="stable"), axis=axis)
-        out |= (rank < settings.candidates) & (cosine >= best - settings.look_alike)
+        out |= (rank < settings.candidates) & (cosine >= best - settings.cosine_margin)
     return np.argwhere(out & (cosine >= settings.least_cosine))
 
 
-def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings) -> tuple[Ints, float, float]:
+def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: SimilaritySettings) -> tuple[Ints, float, float]:
     """Return largest set of candidate pairs (P, 2) whose distances agree up to one scale, its score and log scale."""
     pairs = _candidates(cosine, settings)
     none = np.zeros((0, 2), np.int64), 0.0, float("nan")
@@ -171,7 +171,7 @@ def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings
     return pairs[chosen], likeness * turned * number, median
 
 
-def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> tuple[Array, Array]:
+def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: SimilaritySettings) -> tuple[Array, Array]:
     """Return the log ratios of distances for each pair of pairs, NaN where they share an instance, and their scatter.
     (M, M)."""
     i, j = pairs.T
@@ -200,7 +200,7 @@ def _scales(ratio: Array, sigma: Array, most: int = 4) -> list[float]:
     return [float(grid[p]) for p in sorted(peaks, key=lambda p: (-votes[p], p))[:most]]
 
 
-def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]:
+def _consistent(agree: Array, cosine: Array, settings: SimilaritySettings) -> list[int]:
     """Return a large set of pairs each of which agrees with every other, grown from best connected pairs of pairs."""
     linked = np.where(agree >= settings.consistent, agree, 0.0)
     strength = (linked @ linked) * (linked > 0) * (cosine[:, None] + cosine[None])
@@ -222,7 +222,7 @@ def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]
     return best[1]
 
 
-def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> float:
+def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: SimilaritySettings) -> float:
     """2 f - 1, at least 0; f: share of triples of equal orientation seen from above. 1 without a triple that counts."""
     if not u.up.any() or not v.up.any():
         return 1.0

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.chunk_agreement import (
+from list3r.association.revisits.chunk_agreement import (
     ChunkAgreement,
     ChunkAgreementSettings,
     ChunkKeyframes,
     chunk_agreement,
 )
+from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
 

@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.chain import EdgeChains
-from list3r.association.revisits.constellations.constellation import (
-    Constellation,
-    make_constellation,
-    typical_depth,
-)
-from list3r.association.revisits.constellations.matching import match_constellations
-from list3r.association.revisits.constellations.registration import (
+from list3r.association.revisits.constellations.chunk_registration import (
     ConstellationRegistrationSettings,
     RegisteredChunk,
     Registration,
@@ -29,8 +23,14 @@ from list3r.association.revisits.constellations.registration import (
     refusal,
     register,
 )
+from list3r.association.revisits.constellations.constellation import (
+    Constellation,
+    make_constellation,
+    typical_depth,
+)
+from list3r.association.revisits.constellations.matching import match_constellations
+from list3r.association.revisits.constellations.neighbourhood import Neighbour, NeighbourhoodSettings, gather
 from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
-from list3r.association.revisits.constellations.surroundings import Neighbour, SurroundingsSettings, gather
 from list3r.association.revisits.cross_check import Side
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge
@@ -41,7 +41,7 @@ _BELIEF = "things_belief"
 
 
 @dataclass(frozen=True)
-class ThingSearchSettings:
+class InstanceSearchSettings:
     """Where instances are compared."""
 
     enabled: bool = True
@@ -54,14 +54,14 @@ class ThingSearchSettings:
     near: float = 1.5
     """Chunks of the same component are compared within this distance, shares of both typical depths."""
     most_near: int = 4
-    most_looked: int = 16
+    most_checked: int = 16
     """Chunks with the nearest origins whose distance is measured; reading all takes long."""
     least_lead: float = 2.0
     """Least difference of the log odds of an accepted relation and of any that places the new chunk elsewhere."""
     elsewhere: float = 1.5
     """Deviations between two relations from which on they are of two places. Relations of one place mostly differ by
     up to 0.3; similar rooms of one floor by 2.7 and more (research/association 0147)."""
-    surroundings: SurroundingsSettings = field(default_factory=SurroundingsSettings)
+    neighbourhood: NeighbourhoodSettings = field(default_factory=NeighbourhoodSettings)
     registration: ConstellationRegistrationSettings = field(default_factory=ConstellationRegistrationSettings)
 
 
@@ -75,7 +75,7 @@ class _Known:
     """Checksum, centre of the samples (3,) and typical depth of chunks, chunk units."""
 
 
-class ThingSearch:
+class InstanceSearch:
     """The new chunk and the stored ones, as constellations."""
 
     def __init__(
@@ -84,7 +84,7 @@ class ThingSearch:
         rows: dict[int, ChunkRow],
         chunk_id: int,
         side: Callable[[int], Side],
-        settings: ThingSearchSettings,
+        settings: InstanceSearchSettings,
     ) -> None:
         self._store, self._rows, self._id, self._side, self._settings = store, rows, chunk_id, side, settings
         self._known = store.derived.of(_Known)
@@ -158,7 +158,7 @@ class ThingSearch:
         origins = np.array([self._rows[u].S_world_chunk.translation for u in tied])
         nearest = np.argsort(np.linalg.norm(origins - S_world_v.translation, axis=1), kind="stable")
         out = []
-        for u in (tied[k] for k in nearest[: self._settings.most_looked].tolist()):
+        for u in (tied[k] for k in nearest[: self._settings.most_checked].tolist()):
             other, also = self._middle(u, self._rows[u].S_world_chunk)
             off = float(np.linalg.norm(middle - other)) / (reach + also)
             if off <= self._settings.near / 2:
@@ -181,7 +181,7 @@ class ThingSearch:
 
     def _members(self, chunk_id: int, without: Mapping[int, Sim3]) -> dict[int, Sim3]:
         """Return S_here_chunk of a chunk and of its neighbours, by their ids, itself first."""
-        s = self._settings.surroundings
+        s = self._settings.neighbourhood
         out, edge = {chunk_id: Sim3.identity()}, [chunk_id]
         for _ in range(s.steps):
             step = [(k, n, S_k_n) for k in edge for n, S_k_n in self._neighbours.get(k, ()) if n not in out]
@@ -207,10 +207,10 @@ class ThingSearch:
         nodes = {n: self._store.local_instances.nodes([n]) for n in members}
         space = self._store.chunks.feature_space(next(iter(members)))
         parts = [Neighbour(S, nodes[n], self._side(n)) for n, S in members.items()]
-        things, side = gather(parts, space, s.surroundings)
+        merged, side = gather(parts, space, s.neighbourhood)
         how = s.registration.constellation
-        how = how if len(parts) == 1 else replace(how, most_instances=s.surroundings.most_instances)
-        return make_constellation(things, side, space, how), side
+        how = how if len(parts) == 1 else replace(how, most_instances=s.neighbourhood.most_instances)
+        return make_constellation(merged, side, space, how), side
 
     def _place(self, members: Mapping[int, Sim3]) -> RegisteredChunk:
         c, side = self._made(members)
