@@ -1,8 +1,8 @@
-"""How surely scale is carried along a chunk of structure from motion.
+"""The uncertainty of scale along a chunk of structure from motion.
 
-A new frame takes its scale from points that frames before it placed, and those are placed by parallax. A camera that
-turns where it stands shows next to no parallax while they leave the picture, so errors of a fraction of a pixel make
-what comes after the turn larger or smaller than what comes before, by a tenth or more (research/colour-video 0208).
+A new frame takes its scale from points that frames before it triangulated. A camera that rotates in place has next to
+no parallax while they leave the picture, so errors of a fraction of a pixel make the part after the rotation larger or
+smaller than the part before, by a tenth or more (research/colour-video 0208).
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ERROR_RAD = 5e-4
-"""Error of the directions to features that all of them share: a quarter of a pixel of a picture 640 wide."""
+"""Common error of the directions to features: a quarter of a pixel of a picture 640 wide."""
 HALF_VIEW_RAD = 0.38
-"""Turn after which what was in the middle of the picture has left it."""
+"""Rotation after which the middle of the picture has left it."""
 ALONG = 0.3
-"""Parallax of a motion towards what is seen, as a share of that of the same motion to the side."""
+"""Parallax of a motion along the viewing direction, as a share of that of the same motion to the side."""
 MOST_FRAMES = 60
-"""Frames on either side of a step that are asked."""
+"""Frames on either side of a step that are used."""
 LEAST_RAD = 1e-4
-"""Least parallax that is reckoned with."""
+"""Least parallax."""
 
 
 def lost_scale(T_chunk_cam: Array, reach: Array) -> Array:
     """Return the variance of the logarithm of scale that each step between G frames adds. Shape (G - 1,).
 
-    `reach` (G,) is how far the frames see. What is seen on both sides of a step is placed by the parallax between the
-    frames before it that look there, and by that between those after it: relative errors of both add up. Steps that
-    have those frames in common have that error in common, too.
+    `reach` (G,) is the viewing distance of the frames. Points seen on both sides of a step are placed by the parallax
+    between the frames before it that look there, and by that between those after it: relative errors of both add up.
+    Steps that have those frames in common share that error, too.
     """
     count = len(reach)
     parallax, frames, cut = np.zeros((2, count)), np.ones((2, count)), np.zeros((2, count), bool)
@@ -42,7 +42,7 @@ def lost_scale(T_chunk_cam: Array, reach: Array) -> Array:
             parallax[side, k] = np.sqrt(max(float(square.max()), 0.0)) / reach[k]
             frames[side, k], cut[side, k] = seen, seen == len(look) < MOST_FRAMES
     before, after = (0, slice(0, -1)), (1, slice(1, None))
-    for mine, other in ((before, after), (after, before)):  # where the chunk ends the other side tells how it moves
+    for mine, other in ((before, after), (after, before)):  # at the chunk's ends the other side gives the motion
         short = cut[mine] & (parallax[mine] < parallax[other])
         parallax[mine] = np.where(short, parallax[other], parallax[mine])
         frames[mine] = np.where(short, frames[other], frames[mine])

@@ -1,9 +1,9 @@
 """Reconstruction `sfm`: RGB video on a CPU.
 
-Corners are followed through the chunk (`tracks`), its keyframes mapped by pycolmap (`links`, `mapping`), the frames
-between them posed by the map (`fill`), and dense depth swept between the posed frames (`mvs`). The chunk's frame is the
-camera of its first posed frame, its unit such that the middle of all depths is 2; its scale is relative. With given
-poses the structure is triangulated in the source's world. Decision 0066 has the figures.
+Corners are tracked through the chunk (`tracks`), its keyframes mapped by pycolmap (`links`, `mapping`), the frames
+between them posed by the map (`frame_poses`), and dense depth swept between the posed frames (`mvs`). The chunk's frame
+is the camera of its first posed frame, its unit such that the median of all depths is 2; its scale is relative. With
+given poses the structure is triangulated in the source's world. Decision 0066 has the figures.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ class SfmReconstructor:
     camera_known: bool = True
     """Otherwise the focal length is estimated from the chunk alone."""
     detector: LearnedDetector | None = None
-    """What finds the features of keyframes that nothing can be followed between; None for SIFT."""
+    """Finds the features of keyframes that tracks do not connect; None for SIFT."""
 
     def __post_init__(self) -> None:
         if self.poses not in ("given", "estimate"):
             raise OptionError(f"poses {self.poses!r}: choose given or estimate")
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Reconstruct the largest part of a chunk that hangs together; the other frames are not posed.
+        """Reconstruct the largest connected part of a chunk; the other frames are not posed.
 
-        Raises `TrackingError` when the camera cannot be followed through any two frames, with the reason.
+        Raises `TrackingError` when the camera cannot be tracked through any two frames, with the reason.
         """
         grays = [gray_of(f) for f in frames]
         return self._finish(frames, self._segments(frames, grays, camera)[0])
@@ -83,7 +83,7 @@ class SfmReconstructor:
         around: Around | None = None,
         deep: Collection[int] | None = None,
     ) -> list[Reconstruction]:
-        """All parts of a chunk that hang together, in order of time; what lies in none is among the largest's frames.
+        """All connected parts of a chunk, in order of time; frames of none are among the largest's.
 
         With `around` some frames before and behind the chunk are mapped with it. With `deep` only the frames of these
         numbers get depth, and the others a pose. Raises `TrackingError` as above.
@@ -177,7 +177,7 @@ class SfmReconstructor:
         deep: Collection[int] | None = None,
         in_place: bool = False,
     ) -> Reconstruction:
-        """Dense depth, units, keyframes; `in_place` leaves frame of reference and scale as they are."""
+        """Dense depth, units, keyframes; `in_place` keeps frame of reference and scale."""
         T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
         for position, pose in segment.T_map_cam.items():
             T[position], posed[position] = pose, True
@@ -232,7 +232,7 @@ def _with_given_poses(found: SparseMap, poses: dict[int, Poses], tracks: CornerT
 
 
 def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSettings) -> None:
-    """Raise `TrackingError` for frames in which nothing can be followed or nothing moves."""
+    """Raise `TrackingError` for frames without trackable texture or without motion."""
     if len(frames) < 2:
         raise BaselineError(f"{_span(frames)}: depth from colour needs at least two frames from different places")
     if tracks.run.max(initial=-1) < 0:
@@ -246,7 +246,7 @@ def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSe
 
 
 def _no_map(frames: Sequence[Frame], tracks: CornerTracks) -> TrackingError:
-    """Return what is wrong with frames of which no map could be made."""
+    """Return the error for frames of which no map could be made."""
     if int(tracks.run.max()) > len(tracks.run) // 4:
         why = "the camera moves too fast to be followed; film slower, or take more frames"
         return TrackingError(f"{_span(frames)}: {why}")

@@ -1,8 +1,8 @@
-"""Whether pictures can be explained by a camera that only turns; then there is no depth in them, whatever a map says.
+"""Whether pictures can be explained by a camera that only rotates; then a map has no depth.
 
-With a focal length that is wrong, or left free, structure from motion makes a map of such pictures too. So for pairs of
-views the best rotation is asked for at focal lengths around the camera's: x_b ~ K R K^-1 x_a (Hartley and Zisserman,
-Multiple View Geometry, 8.4.2; research/colour-video 0071).
+With a wrong or free focal length, structure from motion makes a map of such pictures too. So for pairs of views the
+best rotation is fitted at focal lengths around the camera's: x_b ~ K R K^-1 x_a (Hartley and Zisserman, Multiple View
+Geometry, 8.4.2; research/colour-video 0071).
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from list3r.reconstruction.sfm.settings import TurningSettings
 
 Floats = NDArray[np.float64]
 Places = Mapping[int, NDArray[np.float32]]
-"""Where something is seen in each view, px. Shape (N, 2)."""
+"""Pixels of common points in each view. Shape (N, 2)."""
 Rows = Mapping[tuple[int, int], NDArray[np.int64]]
-"""Rows of two views that show the same, by the two views' keys, the smaller first. Shape (M, 2)."""
+"""Matching rows of two views, by the two views' keys, the smaller first. Shape (M, 2)."""
 
 
 def only_turns(
     places: Places, pairs: Rows, keys: Collection[int], camera: Camera, settings: TurningSettings | None = None
 ) -> bool:
-    """Return whether the views `keys` of one camera can be explained without it having moved."""
+    """Return whether the views `keys` of one camera can be explained without translation."""
     s = settings or TurningSettings()
     return turning_error(_farthest_pairs(places, pairs, keys, s), camera, s) < s.most_px
 
 
 def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settings: TurningSettings) -> float:
-    """Return what the best rotations leave at the best focal length, px of a picture 640 wide; 0 without pairs."""
+    """Return the residual of the best rotations at the best focal length, px of a picture 640 wide; 0 without pairs."""
     if not pairs:
         return 0.0
     longer = max(camera.width, camera.height)
@@ -55,7 +55,7 @@ def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settin
 def _farthest_pairs(
     places: Places, pairs: Rows, keys: Collection[int], settings: TurningSettings
 ) -> list[tuple[Floats, Floats]]:
-    """Places of what views spread over the video share with the last one that shares enough with each."""
+    """Common pixels of views spread over the video and the last view that shares enough with each."""
     last = {}
     for (a, b), rows in sorted(pairs.items()):
         if a in keys and b in keys and len(rows) >= settings.least_matches:
@@ -66,7 +66,7 @@ def _farthest_pairs(
 
 
 def _pair_error(a: Floats, b: Floats, focal: float, settings: TurningSettings) -> float:
-    """Return the settings' percentile of what the best rotation between two views leaves, px."""
+    """Return the settings' percentile of the residual of the best rotation between two views, px."""
     rays_a, rays_b = (np.column_stack([xy, np.full(len(xy), focal)]) for xy in (a, b))
     rays_a, rays_b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (rays_a, rays_b))
     kept = np.ones(len(a), bool)
