@@ -1,7 +1,7 @@
 """The cache of the Hugging Face hub: its contents, their size and commit, and downloads into it.
 
 The cache's own layout on the disk is read (`models--owner--name/refs|snapshots`), so that looking needs neither network
-nor package. Fetched weights are used from then on: the name of a branch stands for the commit that the cache holds of
+nor package. Fetched weights are used from then on: the name of a branch means the commit that the cache holds of
 it, and nothing asks the network again.
 """
 

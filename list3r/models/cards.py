@@ -105,7 +105,7 @@ class ModelCard:
         assert self.part in PARTS
 
     def memory_with(self, weights: str | None) -> MemoryFigures | None:
-        """Published memory with weights named `owner/name` or `owner/name@revision`; None stands for the first ones."""
+        """Published memory with weights named `owner/name` or `owner/name@revision`; None means the first ones."""
         if weights is None:
             known = self.weights[0] if self.weights else None
         else:

@@ -38,7 +38,7 @@ def pick_device(name: str) -> torch.device:
 def load_named(
     kinds: Mapping[str, str], option: str, name: str, folder: Path, device: str, *, exact: bool = False
 ) -> tuple[Any, torch.device]:
-    """Return the network that a model's name stands for, by its class, and its device.
+    """Return the network of a model's name, by its class, and its device.
 
     `exact` keeps it in float32 everywhere, for networks that half precision breaks.
     Raises `OptionError` as `pick_device` and `load_pretrained` do, and for a name that is none of the kinds.

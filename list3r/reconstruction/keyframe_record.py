@@ -20,7 +20,7 @@ from list3r.reconstruction.features.vlad import describe_frame
 from list3r.reconstruction.rgbd.view import shrink_depth
 from list3r.reconstruction.settings import KeyframeSettings, SampleSettings
 
-FrameLook = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
+FrameDescriptor = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 """A unit descriptor (D,) of a whole picture (H, W, 3)."""
 
 
@@ -30,7 +30,7 @@ class KeyframeNetworks:
 
     detector: LearnedDetector | None = None
     """Of local features, replacing SIFT."""
-    look: FrameLook | None = None
+    frame_descriptor: FrameDescriptor | None = None
     """Of the whole frame, replacing the VLAD of its SIFT features."""
 
 
@@ -224,10 +224,11 @@ def _make_keyframe(
     if networks.detector is not None:
         found = networks.detector(frame.color, settings.learned_count)
         kept = Features(found.xy, as_bytes(found.descriptors), points_at(found.xy, depth, camera))
+    describe = networks.frame_descriptor
     return Keyframe(
         frame_index=frame.index,
         T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
-        descriptor=describe_frame(features.descriptors) if networks.look is None else networks.look(frame.color),
+        descriptor=describe(frame.color) if describe else describe_frame(features.descriptors),
         keypoints_xy=kept.xy,
         keypoint_descriptors=kept.descriptors,
         points_cam=kept.points_cam,

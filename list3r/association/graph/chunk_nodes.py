@@ -17,7 +17,7 @@ from list3r.association.graph.edge_information import about
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
-from list3r.reconstruction.turns import lost_scale
+from list3r.reconstruction.scale_loss import lost_scale
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -148,7 +148,7 @@ def _problem(
     if rest:
         factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
         factors[[not e.accepted for e in rest]] *= _UNTRUSTED
-        stiff = replace(weights.weights, bending=0.0)  # the nodes bend instead
+        stiff = replace(weights.weights, bending=0.0)  # the nodes deform instead
         information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
     fixed = np.zeros(pieces.count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True

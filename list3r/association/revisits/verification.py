@@ -19,7 +19,7 @@ from list3r.memory.records import Edge, Keyframe
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.local import FeaturePose, match, relative_pose
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.rgbd.registration import FrameRegistration, KnownFeatures, Samples, register
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, KnownFeatures, Samples, register
 from list3r.reconstruction.rgbd.settings import RegistrationSettings
 from list3r.reconstruction.rgbd.view import WorkingFrame, surface
 

@@ -102,7 +102,7 @@ class VideoMapSettings:
             whole_iterations=10,
             whole_rounds=1,
             part_iterations=6,
-            settled=1e-4,
+            tolerance=1e-4,
             turned_scale=0.04,
         )
     )

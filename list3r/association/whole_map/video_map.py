@@ -19,7 +19,7 @@ from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.association.whole_map.views import view_of
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.adjustment import adjust
-from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.frame_poses import PosedSegment, pose_segments
 from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps, shared_rows
@@ -61,7 +61,7 @@ def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings:
     if len(joined.T_map_cam) < settings.least_posed * len(tracks.keyframes):
         return None
     found, revisits = _closed(joined, problem, features, camera, settings)
-    segments = fill_segments([found], tracks, grays, sfm.fill, adjusted=True)
+    segments = pose_segments([found], tracks, grays, sfm.frame_poses, adjusted=True)
     if not segments or len(segments[0].T_map_cam) < settings.least_posed * len(grays):
         return None
     return VideoMap(_scaled(segments[0]), revisits, _some_keyframes(found, problem))

@@ -102,7 +102,7 @@ class FeedforwardReconstructor:
         `TrackingError` when a side cannot be posed, or when too few frames would be left.
         """
         first = self._network.loader.place(sides[0].camera.height, sides[0].camera.width)
-        placements = [first, *(self._beside(first, side.camera) for side in sides[1:])]
+        placements = [first, *(self._place_among(first, side.camera) for side in sides[1:])]
         budget = self._ready(first)
         while True:
             count = sum(len(side.frames) for side in sides)
@@ -118,7 +118,7 @@ class FeedforwardReconstructor:
                 raise TrackingError(f"{count} frames of several places do not fit into the memory at once")
             sides = [replace(side, frames=side.frames[::2]) for side in sides]
 
-    def _beside(self, first: Placement, camera: Camera) -> Placement:
+    def _place_among(self, first: Placement, camera: Camera) -> Placement:
         """Where frames of another camera are in pictures of the size of the first ones."""
         own = self._network.loader.place(camera.height, camera.width)
         return own if own.size == first.size else fitted(camera, first.size)

@@ -16,7 +16,7 @@ from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.feedforward.pictures import Placement
 from list3r.reconstruction.feedforward.settings import NetworkSettings
 from list3r.reconstruction.poses import select_keyframes
-from list3r.reconstruction.rgbd.confidence import beside_edge
+from list3r.reconstruction.rgbd.confidence import next_to_edge
 
 LEAST_CONFIDENCE = 0.05
 """Depth of less confidence than this is unknown (the threshold of pi3's authors in their odometry)."""
@@ -161,7 +161,7 @@ def _enlarged(
     depth = np.where(known, one.depth[0], np.float32(0))
     confidence = np.where(known, np.clip(one.confidence[0], 0.0, 1.0), np.float32(0)).astype(np.float32)
     if smeared is not None:
-        confidence[beside_edge(depth, known, smeared.edge_step)] *= np.float32(smeared.edge_confidence)
+        confidence[next_to_edge(depth, known, smeared.edge_step)] *= np.float32(smeared.edge_confidence)
     large = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.999
     out = np.where(large, cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR), np.float32(0))
     sure = np.where(large, cv2.resize(confidence, size, interpolation=cv2.INTER_LINEAR), 0.0)
@@ -184,7 +184,7 @@ def with_given_poses(made: Reconstruction, frames: Sequence[Frame]) -> Reconstru
     away, true = (np.linalg.norm(c - c.mean(axis=0), axis=1) for c in (ours, theirs))
     reach = float(np.median(made.depth[posed][made.depth[posed] > 0]))
     if float(away.max()) < 1e-3 * reach:
-        raise TrackingError(f"the camera stands still in frames {frames[0].index} to {frames[-1].index}: no scale")
+        raise TrackingError(f"the camera does not move in frames {frames[0].index} to {frames[-1].index}: no scale")
     scale = float((away * true).sum() / (away * away).sum())
     return replace(
         made,

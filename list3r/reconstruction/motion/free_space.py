@@ -76,7 +76,7 @@ def movers_in_free_space(
     for order in (posed, posed[::-1]):
         for before, position in itertools.pairwise(order):
             if out[before].any():
-                out[position] |= ask.carried_on(position, out[before] & ~out[position], frames.depth[before])
+                out[position] |= ask.continued(position, out[before] & ~out[position], frames.depth[before])
     return out if out.any() else None
 
 
@@ -113,7 +113,7 @@ class _References:
             return out
         return np.asarray(cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0)
 
-    def carried_on(self, position: int, before: Mask, depth_before: Floats) -> Mask:
+    def continued(self, position: int, before: Mask, depth_before: Floats) -> Mask:
         """Movers of a frame that continue those of an adjacent frame: surfaces that mostly overlap it at equal depth,
         so that an object that is static for a while is not lost.
         """
@@ -130,9 +130,9 @@ class _References:
                 np.bincount(labels.ravel(), image.ravel(), minlength=count) for image in (through, stays, near)
             )
             area = stats[:, cv2.CC_STAT_AREA]
-            good = (gone >= s.hinted * (gone + kept)) & (held >= s.carried * area)
+            good = (gone >= s.hinted * (gone + kept)) & (held >= s.continued * area)
             if region is whole:
-                good |= held >= s.surely_carried * area
+                good |= held >= s.surely_continued * area
             good &= area >= s.least_share * region.size
             good[0] = False
             out |= good[labels]
@@ -155,7 +155,7 @@ class _References:
         votes, asked = np.zeros(len(known), np.int8), np.zeros(len(known), np.int8)
         for side in (-1, 1):
             gone = np.zeros(len(known), bool)
-            for other in self._beside(position, side):
+            for other in self._references_after(position, side):
                 behind, same, seen = self._compare(points, position, other)
                 back |= gone & same
                 gone |= behind
@@ -169,7 +169,7 @@ class _References:
             self._known[position] = found
         return found
 
-    def _beside(self, position: int, side: int) -> list[int]:
+    def _references_after(self, position: int, side: int) -> list[int]:
         near = [p for p in self._positions if side * (p - position) > 0]
         return near if side > 0 else near[::-1]
 

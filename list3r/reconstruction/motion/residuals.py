@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from list3r.compiled import compiled
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.motion.settings import ResidualMoverSettings
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, PosePrior, Samples, register, steps_without
 from list3r.reconstruction.rgbd.kernels import centred
-from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register, steps_without
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 

@@ -80,9 +80,9 @@ class FreeSpaceMoverSettings:
     """Share of its outline that may continue a static surface without a step of depth: feet on a floor."""
     hinted: float = 0.15
     """The same for a surface that is a mover of the odometry."""
-    carried: float = 0.6
+    continued: float = 0.6
     """Share of a surface that must overlap movers of the frame before, at equal depth, to continue them,"""
-    surely_carried: float = 0.8
+    surely_continued: float = 0.8
     """and of a whole surface that continues them though no frame saw through it: an object that is static."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 

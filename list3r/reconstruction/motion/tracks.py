@@ -204,8 +204,8 @@ def _took_in(whole: MoverTrack, track: MoverTrack, s: MoverTrackSettings) -> boo
     """Merge a track into one that it is next to; returns whether it was."""
     by_frame = {b.position: n for n, b in enumerate(whole.blobs)}
     shared = [(b, by_frame[b.position]) for b in track.blobs if b.position in by_frame]
-    beside = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
-    if not shared or len(shared) < s.together * len(track.blobs) or len(beside) < s.together * len(shared):
+    near = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
+    if not shared or len(shared) < s.together * len(track.blobs) or len(near) < s.together * len(shared):
         return False
     for blob, n in shared:
         whole.blobs[n] = _union(whole.blobs[n], blob)

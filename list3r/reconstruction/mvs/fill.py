@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.mvs.settings import RegionFillSettings
-from list3r.reconstruction.ranks import medians
+from list3r.reconstruction.order_statistics import medians
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -45,7 +45,7 @@ def agree_and_fuse(
     inverse, variance = seen.inverse, seen.sigma**2
     total, weight = inverse / variance, 1.0 / variance
     square = inverse * total
-    agree, deny, looked = (torch.zeros_like(inverse) for _ in range(3))
+    agree, deny, sampled = (torch.zeros_like(inverse) for _ in range(3))
     for other, warp in zip(others, warps, strict=True):
         x, y, ratio = warp.place(inverse)
         read, inside = look_up(other.inverse, x, y, "nearest")
@@ -58,7 +58,7 @@ def agree_and_fuse(
         seen_there = inside & (known > 0.5)
         near = seen_there & (difference.abs() < limit)
         agree += near
-        looked += inside
+        sampled += inside
         deny += seen_there & (difference < -2.0 * limit)
         w = near / (theirs * gain).clamp_min(1e-9) ** 2
         total += w * (inverse + difference)
@@ -66,7 +66,7 @@ def agree_and_fuse(
         weight += w
     mean = total / weight
     scatter = (square / weight - mean * mean).clamp_min(0.0)
-    needed = looked.clamp(1.0, float(settings.least_agree))
+    needed = sampled.clamp(1.0, float(settings.least_agree))
     keep = seen.known & (agree >= needed) & (agree > deny)
     noise = variance / (1.0 + 0.5 * agree) + scatter / (1.0 + agree)
     sigma = torch.sqrt(noise) / mean.clamp_min(1e-9) + settings.drift
@@ -87,11 +87,11 @@ def fill_flat(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
     return DepthMap(torch.from_numpy(filled).to(device), torch.from_numpy(unsure).to(device))
 
 
-def carry(maps: Sequence[DepthMap], warps: Sequence[Warp], settings: DepthFusionSettings) -> DepthMap:
+def project_depth(maps: Sequence[DepthMap], warps: Sequence[Warp], settings: DepthFusionSettings) -> DepthMap:
     """Depth of keyframes projected into another frame: the nearest in each pixel, averaged. `warps` lead into it."""
     inverse, sigma = stacked([m.inverse for m in maps]), stacked([m.sigma for m in maps])
     rotated, shift = stacked([w.rotated for w in warps]), stacked([w.shift for w in warps])
-    found = splat(inverse, sigma, rotated, shift, settings.carried_tolerance)
+    found = splat(inverse, sigma, rotated, shift, settings.projected_tolerance)
     return DepthMap(*(torch.from_numpy(image).to(maps[0].inverse.device) for image in found))
 
 

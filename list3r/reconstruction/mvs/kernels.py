@@ -158,8 +158,8 @@ def lowest(cost: Floats) -> tuple[Floats, NDArray[np.int64]]:
         for u in range(width):
             d = min(max(int(first[u]), 1), depths - 2)
             left, middle, right = cost[d - 1, v, u], cost[d, v, u], cost[d + 1, v, u]
-            bend = max(left - np.float32(2.0) * middle + right, np.float32(1e-6))
-            offset = min(max(_HALF * (left - right) / bend, -_ONE), _ONE)
+            curvature = max(left - np.float32(2.0) * middle + right, np.float32(1e-6))
+            offset = min(max(_HALF * (left - right) / curvature, -_ONE), _ONE)
             place[v, u], plane[v, u] = np.float32(d) + offset, d
     return place, plane
 

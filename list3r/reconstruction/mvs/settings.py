@@ -84,17 +84,17 @@ class DepthFusionSettings:
     """and its flatness: deviation from a plane, share of depth."""
     fill_sigma: float = 0.04
     """Stated deviation of filled depth, share of depth."""
-    carried_from: int = 6
+    projected_from: int = 6
     """Keyframes whose depth is projected into a frame."""
-    carried_least: int = 2
+    projected_least: int = 2
     """Least keyframes that see each part of a frame, where there are as many."""
-    carried_tolerance: float = 0.03
+    projected_tolerance: float = 0.03
     """Depths of a pixel that are averaged are at most this share behind the nearest."""
     enlarged_step: float = 0.04
     """Depth difference of two surfaces when a picture is enlarged, share of depth."""
     rim_px: int = 2
     """Outer pixels of foreground surfaces that are left out of a keyframe,"""
-    carried_rim_px: int = 1
+    projected_rim_px: int = 1
     """and of a frame with projected depth: the nearest surface wins there and grows by as much."""
     rim_step: float = 0.04
     """Step of depth, share of it, between foreground and background."""

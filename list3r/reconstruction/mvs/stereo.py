@@ -24,9 +24,9 @@ from list3r.reconstruction.mvs.fusion import (
     DepthMap,
     SweptDepth,
     agree_and_fuse,
-    carry,
     enlarge,
     fill_flat,
+    project_depth,
     rims_out,
     speckles_out,
 )
@@ -47,9 +47,9 @@ from list3r.reconstruction.mvs.sweep import (
 )
 from list3r.reconstruction.mvs.views import (
     ViewPairs,
-    choose_carried,
     choose_keyframes,
     choose_neighbours,
+    choose_projected,
     choose_sources,
     pair_views,
     plane_depths,
@@ -321,11 +321,11 @@ def _sweep(chunk: _Chunk, row: int) -> SweptDepth | None:
     match = _matched(chunk, row, swept)
     if chunk.settings.network is None:
         return match
-    told = _predicted(chunk, swept, match, chunk.settings.network)
+    predicted = _predicted(chunk, swept, match, chunk.settings.network)
     return SweptDepth(
-        torch.where(match.known, match.inverse, told.inverse),
-        torch.where(match.known, match.sigma, told.sigma),
-        match.known | told.known,
+        torch.where(match.known, match.inverse, predicted.inverse),
+        torch.where(match.known, match.sigma, predicted.sigma),
+        match.known | predicted.known,
     )
 
 
@@ -398,15 +398,15 @@ def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> Depth
     overlap = np.array([chunk.pairs.overlap[row, position] for row in known])
     overlap[[chunk.keyframes[row] == position for row in known]] = 1.0
     apart = np.array([abs(chunk.keyframes[row] - position) for row in known])
-    best = choose_carried(overlap, chunk.parts[position, known], apart, chunk.settings.fusion)
+    best = choose_projected(overlap, chunk.parts[position, known], apart, chunk.settings.fusion)
     rows = [known[k] for k in best]
     if not rows:
         return None
     T = chunk.T_chunk_cam
     warps = [Warp.between(T[chunk.keyframes[r]], T[position], chunk.fine.camera, chunk.device) for r in rows]
-    carried = carry([maps[r] for r in rows], warps, chunk.settings.fusion)
+    projected = project_depth([maps[r] for r in rows], warps, chunk.settings.fusion)
     fusion = chunk.settings.fusion
-    return rims_out(fill_flat(carried, fusion), fusion.carried_rim_px, fusion.rim_step)
+    return rims_out(fill_flat(projected, fusion), fusion.projected_rim_px, fusion.rim_step)
 
 
 def _full_size(

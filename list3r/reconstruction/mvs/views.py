@@ -95,7 +95,7 @@ def seen_parts(
     return out
 
 
-def choose_carried(
+def choose_projected(
     overlap: Floats, parts: NDArray[np.bool_], apart: NDArray[np.int64], settings: DepthFusionSettings
 ) -> list[int]:
     """Return the keyframes whose depth is projected into a frame, best first.
@@ -105,13 +105,13 @@ def choose_carried(
     seen by few others come first: all close views of one part would leave the rest of the frame without depth.
     """
     order = [int(k) for k in np.lexsort((apart, -overlap)) if overlap[k] > 0]
-    told, first = np.zeros(parts.shape[1], dtype=np.int64), list[int]()
+    covered, first = np.zeros(parts.shape[1], dtype=np.int64), list[int]()
     for k in order:
-        if (parts[k] & (told < settings.carried_least)).sum() >= 2:
+        if (parts[k] & (covered < settings.projected_least)).sum() >= 2:
             first.append(k)
-            told += parts[k]
-    first = first[: settings.carried_from]
-    return first + [k for k in order if k not in first][: settings.carried_from - len(first)]
+            covered += parts[k]
+    first = first[: settings.projected_from]
+    return first + [k for k in order if k not in first][: settings.projected_from - len(first)]
 
 
 def choose_sources(

@@ -62,8 +62,8 @@ PUBLISHED: dict[str, Any] = {
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
     """Return the network. Raises `OptionError` in one line."""
-    beside = path / "config.json"
-    config = PUBLISHED | (json.loads(beside.read_text(encoding="utf-8")) if beside.is_file() else {})
+    own = path / "config.json"
+    config = PUBLISHED | (json.loads(own.read_text(encoding="utf-8")) if own.is_file() else {})
 
     def make_network() -> Any:
         return cls(cls.config_class(**config))

@@ -32,7 +32,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """Return the network, whose decoder looks for no poses and whose heads take a few pictures at a time."""
+    """Return the network, whose decoder predicts no poses and whose heads take a few pictures at a time."""
     model = load_upstream(cls, path, device)
     if hasattr(model, "decode"):
         _decode_without_poses(model)

@@ -62,7 +62,7 @@ def _facing(cosine: Floats, camera: Camera, settings: ConfidenceSettings) -> Flo
     return np.asarray(cv2.resize(factor, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def beside_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
+def next_to_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
     """Pixels next to a jump of depth by more than a share `step` of it. Shape (H, W)."""
     window = np.ones((3, 3), np.uint8)
     highest = cv2.dilate(depth, window)

@@ -1,4 +1,4 @@
-"""The loops of `registration` and `surfels`. Images have the shape (h, w), intrinsics are (fx, fy, cx, cy)."""
+"""The loops of `frame_registration` and `surfels`. Images have the shape (h, w), intrinsics are (fx, fy, cx, cy)."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from list3r.frames.base import Camera, Frame
 from list3r.frames.deferred import LazyFrame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
 from list3r.reconstruction.motion.residuals import Mask, MoverMemory, fit, mover_in_residuals, without
+from list3r.reconstruction.pose_prior import given_step
 from list3r.reconstruction.poses import angle_deg, shows_more
-from list3r.reconstruction.prior import given_step
-from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame, cosines, make_view
@@ -55,7 +55,7 @@ def _explained(found: FrameRegistration) -> float:
     return found.overlap * found.inliers * _alike(found)
 
 
-class _LookCloserError(Exception):
+class _SkippedFramesNeededError(Exception):
     """A frame is not found from the last tracked one: the skipped frames between are needed."""
 
 
@@ -107,7 +107,7 @@ class CameraTracker:
                 continue
             try:
                 self._step(position)
-            except _LookCloserError:
+            except _SkippedFramesNeededError:
                 self._step_all([*self._take_waiting(), position])
             if self._waiting:
                 self.passed.append(self._take_waiting())
@@ -347,7 +347,7 @@ class CameraTracker:
         before it were skipped.
         """
         if self._waiting:
-            raise _LookCloserError
+            raise _SkippedFramesNeededError
         last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]

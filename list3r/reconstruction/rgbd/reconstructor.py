@@ -1,7 +1,7 @@
 """Reconstruction `rgbd`: sensor depth with poses that are given or estimated.
 
 Estimated poses come from dense registration of each frame to a model of surface elements, depth and brightness
-together (`odometry`, `registration`, `surfels`); local features find frames again after a break (`features`).
+together (`odometry`, `frame_registration`, `surfels`); local features find frames again after a break (`features`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import PosedOnly, Reconstruction
 from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
 from list3r.reconstruction.motion.tracks import track_movers
+from list3r.reconstruction.pose_prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.poses import given_poses, select_keyframes
-from list3r.reconstruction.prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker

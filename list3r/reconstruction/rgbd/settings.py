@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from list3r.reconstruction.base import KeyframeSpacing, SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.motion.settings import FreeSpaceMoverSettings, MoverTrackSettings, ResidualMoverSettings
-from list3r.reconstruction.prior import PriorSettings
+from list3r.reconstruction.pose_prior import PriorSettings
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.rgbd.frame_registration import Samples
 from list3r.reconstruction.rgbd.kernels import foremost, fuse
-from list3r.reconstruction.rgbd.registration import Samples
 from list3r.reconstruction.rgbd.settings import SurfelSettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 

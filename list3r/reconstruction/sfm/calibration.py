@@ -258,7 +258,7 @@ def _adjust_together(
     for image_id in made.reg_image_ids():
         config.add_image(image_id)
     for left in reversed(range(settings.rounds)):
-        solver.solver_options.function_tolerance = settings.early_settled if left else settings.settled
+        solver.solver_options.function_tolerance = settings.early_tolerance if left else settings.tolerance
         pycolmap.create_default_bundle_adjuster(options, config, made).solve()
         pycolmap.ObservationManager(made).filter_points3D_with_large_reprojection_error(
             settings.most_error_px, set(made.points3D), pycolmap.ReprojectionErrorType.PIXEL

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.scale_loss import lost_scale
 from list3r.reconstruction.sfm.colmap import pycolmap
 from list3r.reconstruction.sfm.mapping import (
     MapProblem,
@@ -26,11 +27,10 @@ from list3r.reconstruction.sfm.mapping import (
     adjusted,
     database_of,
     sparse_map,
-    without_beside,
+    without_context,
 )
+from list3r.reconstruction.sfm.pure_rotation import only_turns
 from list3r.reconstruction.sfm.settings import MappingSettings
-from list3r.reconstruction.sfm.turning import only_turns
-from list3r.reconstruction.turns import lost_scale
 
 
 def with_global_map(
@@ -61,7 +61,7 @@ def _left_apart(maps: Sequence[SparseMap], problem: MapProblem, settings: Mappin
     """Return whether a keyframe shares enough matches with one in another map, or in none."""
     of = {key: n for n, m in enumerate(maps) for key in m.T_map_cam}
     return any(
-        len(rows) >= settings.least_matches and of.get(a) != of.get(b) and not {a, b} & problem.beside
+        len(rows) >= settings.least_matches and of.get(a) != of.get(b) and not {a, b} & problem.context
         for (a, b), rows in pairs.items()
     )
 
@@ -101,7 +101,7 @@ def global_map(
     if found is None:
         return None
     poses = _held(found, settings)
-    found = without_beside(replace(found, T_map_cam=poses, seen={k: found.seen[k] for k in poses}), problem)
+    found = without_context(replace(found, T_map_cam=poses, seen={k: found.seen[k] for k in poses}), problem)
     places = {key: view.xy for key, view in problem.views.items()}
     if len(found.T_map_cam) < 2 or only_turns(places, problem.pairs, found.T_map_cam, camera, settings.turning):
         return None

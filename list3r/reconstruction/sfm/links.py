@@ -49,9 +49,9 @@ def corner_problem(tracks: CornerTracks, settings: LinkSettings) -> MapProblem:
     return MapProblem(views, pairs)
 
 
-def step_beside(tracks: CornerTracks, settings: LinkSettings) -> int:
+def context_step(tracks: CornerTracks, settings: LinkSettings) -> int:
     """Return the distance, in frames, of the context frames that are mapped with a chunk."""
-    apart = settings.beside_step * len(tracks.run) / max(1, len(tracks.keyframes))
+    apart = settings.context_step * len(tracks.run) / max(1, len(tracks.keyframes))
     return int(np.clip(round(apart), 1, settings.most_step))
 
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.consistency import contradicted
+from list3r.reconstruction.sfm.pure_rotation import only_turns
 from list3r.reconstruction.sfm.settings import MappingSettings
-from list3r.reconstruction.sfm.turning import only_turns
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -73,7 +73,7 @@ class MapProblem:
     """Matching rows of the views, by keys, the smaller first. Shape (M, 2)."""
     matched: frozenset[tuple[int, int]] = frozenset()
     """Pairs whose rows were not tracked but matched by descriptors."""
-    beside: frozenset[int] = frozenset()
+    context: frozenset[int] = frozenset()
     """Views that help to make the map and are left out of it afterwards."""
 
 
@@ -107,7 +107,7 @@ def build_maps(
     for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
         made = _grown(work, pair)
         maps = [found for found, _ in made]
-        own = [(without_beside(found, problem), model) for found, model in made]
+        own = [(without_context(found, problem), model) for found, model in made]
         own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
         grown.append([found for found, _ in own])
         models |= {id(found): model for found, model in own}
@@ -123,7 +123,7 @@ def build_maps(
 
 def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[int, int]]:
     """Further initial pairs of keyframes: those that share most in the second and the last third."""
-    own = sorted(problem.views.keys() - problem.beside)
+    own = sorted(problem.views.keys() - problem.context)
     place = {key: n for n, key in enumerate(own)}
     least, most = settings.given_steps
     out = []
@@ -182,7 +182,7 @@ def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
     if not work.settings.rough_iterations:
         return found
     whole = _adjust(work, model)
-    own = without_beside(whole, work.problem)
+    own = without_context(whole, work.problem)
     return own if _enough(whole, work.settings) and len(own.T_map_cam) >= 2 else found
 
 
@@ -196,7 +196,7 @@ def _adjust(work: _Work, model: Any) -> SparseMap:
     adjustment.print_summary = False
     solver = adjustment.ceres.solver_options
     solver.num_threads, solver.max_num_iterations = 1, settings.whole_iterations
-    solver.function_tolerance = settings.settled
+    solver.function_tolerance = settings.tolerance
     mapper = pycolmap.IncrementalMapper(work.cache)
     mapper.begin_reconstruction(model)
     change = options.ba_global_max_refinement_change
@@ -221,10 +221,10 @@ def _largest_first(found: SparseMap) -> tuple[int, int]:
     return -len(found.T_map_cam), min(found.T_map_cam)
 
 
-def without_beside(found: SparseMap, problem: MapProblem) -> SparseMap:
+def without_context(found: SparseMap, problem: MapProblem) -> SparseMap:
     """Return the map without the context views."""
-    poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
-    seen = {k: view for k, view in found.seen.items() if k not in problem.beside}
+    poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.context}
+    seen = {k: view for k, view in found.seen.items() if k not in problem.context}
     return replace(found, T_map_cam=poses, seen=seen)
 
 
@@ -432,7 +432,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     options.ba_local_max_refinements = settings.part_rounds
     options.ba_global_max_num_iterations = settings.whole_iterations
     options.ba_global_max_refinements = settings.whole_rounds
-    options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.settled
+    options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.tolerance
     options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
     mapper, unit = options.mapper, pixel_unit(camera)
     mapper.num_threads, mapper.random_seed = 1, settings.seed

@@ -27,10 +27,10 @@ from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.sfm.adjustment import agreeing_rows
 from list3r.reconstruction.sfm.colmap import pixel_unit
-from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.frame_poses import PosedSegment, pose_segments
 from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import make_finder
-from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, step_beside, with_neighbours
+from list3r.reconstruction.sfm.links import context_step, corner_problem, keyframe_problem, with_neighbours
 from list3r.reconstruction.sfm.mapping import MapProblem, Matches, SparseMap, build_maps, triangulate
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
@@ -123,7 +123,7 @@ class SfmReconstructor:
             return [self._given(frames, tracks, problem, camera)]
         _check_motion(frames, tracks, s)
         maps = self._maps(frames, grays, tracks, problem, camera, around)
-        segments = fill_segments(maps, tracks, grays, s.fill)
+        segments = pose_segments(maps, tracks, grays, s.fill)
         if not segments:
             raise _no_map(frames, tracks)
         return segments
@@ -139,12 +139,12 @@ class SfmReconstructor:
     ) -> list[SparseMap]:
         """Maps of the keyframes, made with the help of frames around the chunk."""
         s = self.settings
-        before, behind = ((), ()) if around is None else around(step_beside(tracks, s.links), s.links.beside)
-        beside = [*before, *behind]
-        early, late = np.split(len(frames) + np.arange(len(beside)), [len(before)])
+        before, behind = ((), ()) if around is None else around(context_step(tracks, s.links), s.links.context)
+        context = [*before, *behind]
+        early, late = np.split(len(frames) + np.arange(len(context)), [len(before)])
         count = s.links.ahead_features
         few = replace(s.links.features, width=s.links.ahead_width, count=count, learned_count=count)
-        seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
+        seen, colors = [*grays, *map(gray_of, context)], [f.color for f in (*frames, *context)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         if not self.camera_known:
@@ -242,7 +242,7 @@ def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSe
             why = f"pictures of {width}x{height} are too small; give them as they were taken"
         raise TrackingError(f"{_span(frames)}: no texture to follow; {why}")
     if np.nansum(tracks.flow) < settings.least_flow:
-        raise BaselineError(f"{_span(frames)}: the camera stands still; depth from colour needs it to move")
+        raise BaselineError(f"{_span(frames)}: the camera does not move, and depth from colour needs motion")
 
 
 def _no_map(frames: Sequence[Frame], tracks: CornerTracks) -> TrackingError:

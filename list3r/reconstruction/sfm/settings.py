@@ -52,7 +52,7 @@ class CornerSettings:
     """... or when no more than this share of them is left."""
     least_survival: float = 0.25
     """Share below which the corners count as lost from one frame to the next."""
-    look_past: int = 3
+    most_lost: int = 3
     """Frames in which corners may be lost and still be found again behind."""
     least_corners: int = 30
     """Fewer corners than this are not tracked."""
@@ -87,9 +87,9 @@ class LinkSettings:
     features: FinderSettings = field(default_factory=FinderSettings)
     least_matches: int = 20
     """Fewest shared corners or features of a pair."""
-    beside: int = 8
+    context: int = 8
     """Frames on either side of a chunk that are mapped with it."""
-    beside_step: float = 2.0
+    context_step: float = 2.0
     """Their distance, by that of the chunk's keyframes."""
     most_step: int = 25
     """... and at most this many frames."""
@@ -113,7 +113,7 @@ class ConsistencySettings:
 
 
 @dataclass(frozen=True)
-class TurningSettings:
+class PureRotationSettings:
     """When a camera only rotates."""
 
     most_px: float = 2.0
@@ -176,7 +176,7 @@ class MappingSettings:
     rough_iterations: int = 0
     """Most iterations of the whole map while it grows, then once each time; the kept map is adjusted as above
     when it is complete. 0 for maps that are always adjusted so."""
-    settled: float = 0.0
+    tolerance: float = 0.0
     """Adjustments end when a step gains less than this share of the error."""
     turned_scale: float = 0.0
     """A map of all keyframes at once is tried where rotations lose that much of the scale, or maps separate keyframes
@@ -190,7 +190,7 @@ class MappingSettings:
     """Fewest points of an accepted map."""
     seed: int = 1
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
-    turning: TurningSettings = field(default_factory=TurningSettings)
+    turning: PureRotationSettings = field(default_factory=PureRotationSettings)
 
 
 @dataclass(frozen=True)
@@ -261,9 +261,9 @@ class CameraCalibrationSettings:
     """Observations farther from their point's image than this are left out."""
     rounds: int = 3
     """Joint adjustments, each without the outliers of the one before."""
-    settled: float = 1e-5
+    tolerance: float = 1e-5
     """The last of them ends when a step gains less than this share of the error,"""
-    early_settled: float = 1e-3
+    early_tolerance: float = 1e-3
     """and those before it, which only find outliers."""
     focal_range: tuple[float, float] = (0.4, 3.0)
     """Accepted focal lengths, by the longer side of the picture."""
@@ -287,7 +287,13 @@ def maps_of_chunks() -> MappingSettings:
     """Return how the keyframes of a chunk are mapped: to convergence, and grown roughly, which is as near to the truth
     and to the pictures (research/speed 0157 and 0181)."""
     return MappingSettings(
-        settled=1e-4, growth=2.0, part_iterations=5, part_rounds=1, part_views=4, rough_iterations=10, turned_scale=0.05
+        tolerance=1e-4,
+        growth=2.0,
+        part_iterations=5,
+        part_rounds=1,
+        part_views=4,
+        rough_iterations=10,
+        turned_scale=0.05,
     )
 
 

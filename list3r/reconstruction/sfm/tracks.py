@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.features.local import shrinkage, shrunk
-from list3r.reconstruction.ranks import median, medians
+from list3r.reconstruction.order_statistics import median, medians
 from list3r.reconstruction.sfm.settings import CornerSettings
 
 Gray = NDArray[np.uint8]
@@ -48,7 +48,7 @@ def follow_corners(grays: Sequence[Gray], settings: CornerSettings | None = None
     chosen = settings or CornerSettings()
     follower = _Follower(chosen, grays[0].shape)
     while (at := len(follower.ids)) < len(grays):
-        ahead = grays[at : at + 1 + chosen.look_past]
+        ahead = grays[at : at + 1 + chosen.most_lost]
         skipped = next((n for n, gray in enumerate(ahead) if follower.follow(gray)), None)
         if skipped is None:
             follower.start(grays[at])
@@ -84,14 +84,14 @@ def as_bright(
         off = np.abs(gain * a + offset - b)
         kept = off <= max(2.0, 3.0 * median(off))
     was, left = median(np.abs(a - b)), median(np.abs(gain * a + offset - b))
-    if was < least or left > _UNTOLD * was:
+    if was < least or left > _MOST_UNEXPLAINED * was:
         return old
     return np.asarray(
         cv2.LUT(old, np.clip(np.rint(gain * np.arange(256.0) + offset), 0, 255).astype(np.uint8)), np.uint8
     )
 
 
-_UNTOLD = 0.5
+_MOST_UNEXPLAINED = 0.5
 """Most of the difference that brightness and contrast may leave unexplained."""
 _BLACK, _WHITE = 8.0, 247.0
 """Grey values beyond which a camera is saturated."""

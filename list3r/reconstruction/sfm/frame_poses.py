@@ -39,7 +39,7 @@ class PosedSegment:
         return xy[z > 0].astype(np.float64), z[z > 0]
 
 
-def fill_segments(
+def pose_segments(
     maps: Sequence[SparseMap],
     tracks: CornerTracks,
     grays: Sequence[Gray],

@@ -35,12 +35,12 @@ def lost_scale(T_chunk_cam: Array, reach: Array) -> Array:
     parallax, frames, cut = np.zeros((2, count)), np.ones((2, count)), np.zeros((2, count), bool)
     for k in range(count):
         for side, others in enumerate((slice(k, None, -1), slice(k, None))):
-            look = T_chunk_cam[others, :3, 2][:MOST_FRAMES] @ T_chunk_cam[k, :3, 2] > np.cos(HALF_VIEW_RAD)
-            seen = int(np.argmin(np.append(look, False)))
+            facing = T_chunk_cam[others, :3, 2][:MOST_FRAMES] @ T_chunk_cam[k, :3, 2] > np.cos(HALF_VIEW_RAD)
+            seen = int(np.argmin(np.append(facing, False)))
             way = T_chunk_cam[others, :3, 3][:seen] - T_chunk_cam[k, :3, 3]
             square = (way**2).sum(axis=1) - (1.0 - ALONG**2) * (way @ T_chunk_cam[k, :3, 2]) ** 2
             parallax[side, k] = np.sqrt(max(float(square.max()), 0.0)) / reach[k]
-            frames[side, k], cut[side, k] = seen, seen == len(look) < MOST_FRAMES
+            frames[side, k], cut[side, k] = seen, seen == len(facing) < MOST_FRAMES
     before, after = (0, slice(0, -1)), (1, slice(1, None))
     for mine, other in ((before, after), (after, before)):  # at the chunk's ends the other side gives the motion
         short = cut[mine] & (parallax[mine] < parallax[other])

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.ranks import median, quantile
-from list3r.reconstruction.sfm.settings import TurningSettings
+from list3r.reconstruction.order_statistics import median, quantile
+from list3r.reconstruction.sfm.settings import PureRotationSettings
 
 Floats = NDArray[np.float64]
 Places = Mapping[int, NDArray[np.float32]]
@@ -25,14 +25,14 @@ Rows = Mapping[tuple[int, int], NDArray[np.int64]]
 
 
 def only_turns(
-    places: Places, pairs: Rows, keys: Collection[int], camera: Camera, settings: TurningSettings | None = None
+    places: Places, pairs: Rows, keys: Collection[int], camera: Camera, settings: PureRotationSettings | None = None
 ) -> bool:
     """Return whether the views `keys` of one camera can be explained without translation."""
-    s = settings or TurningSettings()
+    s = settings or PureRotationSettings()
     return turning_error(_farthest_pairs(places, pairs, keys, s), camera, s) < s.most_px
 
 
-def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settings: TurningSettings) -> float:
+def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settings: PureRotationSettings) -> float:
     """Return the residual of the best rotations at the best focal length, px of a picture 640 wide; 0 without pairs."""
     if not pairs:
         return 0.0
@@ -53,7 +53,7 @@ def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settin
 
 
 def _farthest_pairs(
-    places: Places, pairs: Rows, keys: Collection[int], settings: TurningSettings
+    places: Places, pairs: Rows, keys: Collection[int], settings: PureRotationSettings
 ) -> list[tuple[Floats, Floats]]:
     """Common pixels of views spread over the video and the last view that shares enough with each."""
     last = {}
@@ -65,7 +65,7 @@ def _farthest_pairs(
     return [(places[a][r[:, 0]].astype(np.float64), places[b][r[:, 1]].astype(np.float64)) for a, b, r in rows_of]
 
 
-def _pair_error(a: Floats, b: Floats, focal: float, settings: TurningSettings) -> float:
+def _pair_error(a: Floats, b: Floats, focal: float, settings: PureRotationSettings) -> float:
     """Return the settings' percentile of the residual of the best rotation between two views, px."""
     rays_a, rays_b = (np.column_stack([xy, np.full(len(xy), focal)]) for xy in (a, b))
     rays_a, rays_b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (rays_a, rays_b))
