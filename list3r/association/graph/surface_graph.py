@@ -50,8 +50,7 @@ def place_by_surfaces(
 ) -> tuple[GraphResult, dict[int, Bend]]:
     """Return the graph with its chunks placed by surfaces, and corrections that keep the cameras in place.
 
-    The first chunk of each component stays; the cameras of a component move together, by the mean motion of its
-    chunks.
+    The first chunk of each component stays; the cameras of a component move together, by the mean motion of its chunks.
     """
     s = settings or SurfaceSettings()
     known = graph.S_graph_chunk

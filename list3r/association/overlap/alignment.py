@@ -49,8 +49,7 @@ class AlignmentSettings:
     least_width: float = 1e-4
     """Second extent of the points as a share of the first, below which they are on one line."""
     line_noise: float = 0.25
-    """Points are on one line up to noise where their second extent (squared) is below this share of the noise
-    and"""
+    """Points are on one line up to noise where their second extent (squared) is below this share of the noise and"""
     line_share: float = 0.01
     """below this share of the first extent (squared)."""
     bending_gain: float = 10.0

@@ -72,8 +72,7 @@ def displacement(pairs: Pairs, S_v_u: Sim3, camera: Camera, sure: Mask, removed:
 def inconsistency(
     off: Displacement, regions: Regions, frame: Ints, camera: Camera, settings: EdgeSupportSettings
 ) -> Inconsistency:
-    """Return each region's displacement, and its ratio to the largest one of static regions. `frame` has shape
-    (N,)."""
+    """Return each region's displacement, and its ratio to the largest one of static regions. `frame` has shape (N,)."""
     sure, rest = off.sure, off.rest
     medians, row, weight = _by_region_and_frame(off.share, regions, frame, sure)
     total = np.maximum(np.bincount(row, weight, len(regions.count)), 1e-12)

@@ -37,8 +37,7 @@ class SimilaritySettings:
     sigma: float = 0.15
     """Difference of two log distances at which a pair of pairs counts 1/e."""
     least_lean: float = 0.25
-    """Least height of a triple's normal over its area, in [0, 1], from which its orientation seen from above
-    counts."""
+    """Least height of a triple's normal over its area, in [0, 1], from which its orientation seen from above counts."""
     consistent: float = 0.37
     """Least score of a pair of pairs for both to belong to one layout (1/e: one sigma)."""
 

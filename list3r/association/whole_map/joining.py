@@ -1,6 +1,5 @@
 """Join maps of parts of one video where they overlap: a camera that rotates in place passes no scale on, and the map
-breaks there.
-"""
+breaks there."""
 
 from __future__ import annotations
 

@@ -92,8 +92,7 @@ def relation(
     points_a: Array, xy_b: NDArray[np.float32], points_b: Array, camera: Camera, settings: RevisitPairSettings
 ) -> ViewRelation | None:
     """Return the relation of two views from points of a, (M, 3) in its camera coordinates, their pixels in b, (M, 2),
-    and the same points of b's map, (M, 3) in b's camera; NaN where unknown.
-    """
+    and the same points of b's map, (M, 3) in b's camera; NaN where unknown."""
     known = np.isfinite(points_a[:, 0])
     points, xy_b, points_b = points_a[known], xy_b[known], points_b[known]
     found = pose_of(xy_b, points, camera, None, settings.pose)

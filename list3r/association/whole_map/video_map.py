@@ -61,7 +61,7 @@ def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings:
     if len(joined.T_map_cam) < settings.least_posed * len(tracks.keyframes):
         return None
     found, revisits = _closed(joined, problem, features, camera, settings)
-    segments = pose_segments([found], tracks, grays, sfm.frame_poses, adjusted=True)
+    segments = pose_segments([found], tracks, grays, sfm.fill, adjusted=True)
     if not segments or len(segments[0].T_map_cam) < settings.least_posed * len(grays):
         return None
     return VideoMap(_scaled(segments[0]), revisits, _some_keyframes(found, problem))

@@ -115,8 +115,7 @@ class _References:
 
     def continued(self, position: int, before: Mask, depth_before: Floats) -> Mask:
         """Movers of a frame that continue those of an adjacent frame: surfaces that mostly overlap it at equal depth,
-        so that an object that is static for a while is not lost.
-        """
+        so that an object that is static for a while is not lost."""
         s, depth = self._s, self._frames.depth[position]
         out = np.zeros(depth.shape, bool)
         if before.sum() < s.least_share * before.size:
@@ -204,8 +203,7 @@ def _disagreement(apart: Floats, z: Floats, s: FreeSpaceMoverSettings) -> float:
 
 def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: FreeSpaceMoverSettings) -> Mask:
     """The connected parts of a region of which a share of the compared pixels was seen through, and that are not
-    embedded in a static surface.
-    """
+    embedded in a static surface."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
     area, least = stats[:, cv2.CC_STAT_AREA], s.least_share * region.size
     gone = np.bincount(labels.ravel(), through.ravel(), minlength=count)

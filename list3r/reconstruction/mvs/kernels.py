@@ -22,9 +22,8 @@ def zncc_cost(
 ) -> Floats:
     """Return the mean matching cost of inverse depths over sources, 0.5 where no source sees the place.
 
-    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `ways`,
-    (S, 3, h, w) rotated and (S, 3) shifted, project pixels into them; `depths` (D, h, w) or (D, 1, 1).
-    Shape (D, h, w).
+    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `ways`, (S, 3,
+    h, w) rotated and (S, 3) shifted, project pixels into them; `depths` (D, h, w) or (D, 1, 1). Shape (D, h, w).
     """
     _, height, width = reference.shape
     rotated, shift = ways
@@ -52,9 +51,7 @@ def zncc_cost(
 
 @compiled
 def _place_row(to: Floats, by: Floats, v: int, inverse: Floats, place: Floats, inside: Floats) -> None:
-    """Write the projections of a row's pixels into another picture, clamped to its border, and which are
-    inside.
-    """
+    """Write the projections of a row's pixels into another picture, clamped to its border, and which are inside."""
     right, bottom = np.float32(to.shape[2] - 1), np.float32(to.shape[1] - 1)
     dx, dy, dz = by[0], by[1], by[2]
     for u in range(to.shape[2]):
@@ -141,8 +138,7 @@ def _column_sums(values: Floats, v: int, radius: int, out: Floats) -> None:
 @compiled
 def lowest(cost: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Return the position of the least of costs (D, h, w), D >= 3, by a parabola, and its whole plane; see
-    `sweep.below_planes`.
-    """
+    `sweep.below_planes`."""
     depths, height, width = cost.shape
     place, plane = np.empty((height, width), np.float32), np.empty((height, width), np.int64)
     least, first = np.empty(width, np.float32), np.empty(width, np.int32)

@@ -1,10 +1,9 @@
 """Reconstruction `fast3r` (Yang et al., "Fast3R: Towards 3D Reconstruction of 1000+ Images in One Forward Pass").
 
-Pictures in [-1, 1], the longer side 512, cut to whole patches of 16. For each come back `pts3d_in_other_view` (1, h,
-w, 3) in the camera of the first picture with `conf` = 1 + exp(x), and from its second head `pts3d_local` in the
-picture's own camera. There are no poses: the focal length is that of the first picture, whose points are in its own
-camera, and a picture's pose is the one that projects its points to their pixels, as in its authors' own
-evaluation.
+Pictures in [-1, 1], the longer side 512, cut to whole patches of 16. For each come back `pts3d_in_other_view` (1, h, w,
+3) in the camera of the first picture with `conf` = 1 + exp(x), and from its second head `pts3d_local` in the picture's
+own camera. There are no poses: the focal length is that of the first picture, whose points are in its own camera, and a
+picture's pose is the one that projects its points to their pixels, as in its authors' own evaluation.
 """
 
 from __future__ import annotations

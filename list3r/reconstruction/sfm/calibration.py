@@ -1,8 +1,7 @@
 """Estimate the lens of an RGB source once before its chunks: focal length and radial distortion.
 
 Windows spread over the video are mapped each by itself with a free camera, and then adjusted together with one camera
-for all. A window is weighted by its parallax. All chunks use the estimated camera (research/colour-video
-0069).
+for all. A window is weighted by its parallax. All chunks use the estimated camera (research/colour-video 0069).
 """
 
 from __future__ import annotations

@@ -131,9 +131,8 @@ def pose_of(
 
 
 _ITERATIONS, _ROUNDS = 3, 6
-"""Steps of a refinement, after which inliers are selected again, until they no longer change, and the most such
-rounds. The last steps to a minimum change the error of a path by hundredths of a millimetre (research/speed
-0183)."""
+"""Steps of a refinement, after which inliers are selected again, until they no longer change, and the most such rounds.
+The last steps to a minimum change the error of a path by hundredths of a millimetre (research/speed 0183)."""
 
 
 def _refined(

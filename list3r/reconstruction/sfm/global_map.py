@@ -39,8 +39,7 @@ def with_global_map(
     """Return maps that grew from the keyframes of a problem, the largest first.
 
     Where rotations may have lost their scale, or they separate keyframes with matches, they are adjusted once more with
-    new points, or replaced by a global map that explains as many observations. `verified` is as for
-    `correspondences`.
+    new points, or replaced by a global map that explains as many observations. `verified` is as for `correspondences`.
     """
     if not maps or settings.turned_scale <= 0.0:
         return list(maps)

@@ -1,6 +1,5 @@
 """Local features of keyframes, and which keyframes are worth matching: those whose best features already agree
-(preemptive matching; Wu, "Towards linear-time incremental structure from motion", 3DV 2013).
-"""
+(preemptive matching; Wu, "Towards linear-time incremental structure from motion", 3DV 2013)."""
 
 from __future__ import annotations
 

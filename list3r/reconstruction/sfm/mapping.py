@@ -158,8 +158,7 @@ class _Work:
 
 def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, Any]]:
     """Maps that grow from two keyframes, one from a given pair, each with pycolmap's own; none of a camera that only
-    rotates.
-    """
+    rotates."""
     settings = work.settings
     options = mapper_options(work.camera, work.free_camera, settings)
     if settings.rough_iterations:
@@ -311,9 +310,8 @@ def adjusted(
     settings: MappingSettings,
     verified: Matches | None = None,
 ) -> SparseMap | None:
-    """A map of views with approximate poses: its points are triangulated anew, and all is adjusted; None for too few
-    of them. `verified` is as for `correspondences`.
-    """
+    """A map of views with approximate poses: its points are triangulated anew, and all is adjusted; None for too few of
+    them. `verified` is as for `correspondences`."""
     made = _triangulated(problem, camera, T_map_cam, settings, verified)
     if made is None:
         return None

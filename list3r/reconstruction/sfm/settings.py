@@ -269,8 +269,7 @@ class CameraCalibrationSettings:
     """Accepted focal lengths, by the longer side of the picture."""
     distortion_range: tuple[float, float] = (-0.5, 0.2)
     """Accepted k1. With little parallax a map compensates a focal length that is too long by a large positive k1 that
-    no camera lens has: of 19 windows of redkitchen three have 887, 971 and 2947 px of 524, with 0.26, 0.32
-    and 5.3."""
+    no camera lens has: of 19 windows of redkitchen three have 887, 971 and 2947 px of 524, with 0.26, 0.32 and 5.3."""
     least_shift_px: float = 0.3
     """Distortion that shifts the corners of the picture by less is none."""
     window_sigma: float = 0.09
