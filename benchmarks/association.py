@@ -219,7 +219,7 @@ def _without_instances(revisits: Any) -> Any:
         revisits,
         lambda_=1.0,
         layout_pairs=10**6,
-        things=replace(revisits.things, enabled=False),
+        instances=replace(revisits.instances, enabled=False),
         window=replace(revisits.window, cross=cross),
     )
 

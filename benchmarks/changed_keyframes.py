@@ -25,9 +25,9 @@ from changed_homes import MOST_DEG, MOST_M
 from machine import STARTED_AT, machine, write_json
 
 from benchmarks.simulation.walks import HomeSessionWalk
-from list3r.association.revisits.session_ties import hold_back
+from list3r.association.revisits.all_keyframes import place_by_all_keyframes
+from list3r.association.revisits.session_edges import defer_session_edges
 from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.all_keyframes import place_by_all_keyframes
 from list3r.frames.base import Frame
 from list3r.memory.records import Edge, Keyframe
 from list3r.reconstruction.keyframe_record import make_keyframes
@@ -94,7 +94,7 @@ def _judged(home: Sessions) -> dict[str, Any]:
     accepted = [e for e in pairs if e.accepted]
     row: dict[str, Any] = {"placed": _verdict(found[:1], home[0]), "pairs": len(pairs), "accepted": len(accepted)}
     row["accepted_wrong"] = sum(_verdict([e], home[0]) == "wrong" for e in accepted)
-    row["rule_of_two"] = _verdict([e for e in hold_back(accepted, {1: 1, 2: 2}) if e.accepted][:1], home[0])
+    row["rule_of_two"] = _verdict([e for e in defer_session_edges(accepted, {1: 1, 2: 2}) if e.accepted][:1], home[0])
     if found:
         off_m, off_deg = _off(found[0], home[0])
         row |= {"off_m": round(off_m, 4), "off_deg": round(off_deg, 3), "witnessed": found[0].scores["witnessed"]}

@@ -24,7 +24,7 @@ from benchmarks.feedforward_sim.feedforward import FeedForwardModel
 from benchmarks.peers.plain_alignment import plain_support
 from benchmarks.simulation.presets import make_video
 from benchmarks.simulation.video import SimulatedVideo
-from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, measure_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, measure_edge
 from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.memory.errors import DegenerateError
@@ -119,7 +119,7 @@ def _plain(u: ChunkResult, v: ChunkResult) -> Sim3:
     camera = Camera(width, height, *v.intrinsics)
     settings = EdgeSettings(instance_aware=False)
     try:
-        with patch("list3r.association.overlap.edges.align_support", plain_support):
+        with patch("list3r.association.overlap.overlap_edge.align_support", plain_support):
             return measure_edge(EdgeEnd(1, u.samples), EdgeEnd(2, v.samples), camera, False, settings).edge.S_v_u
     except DegenerateError:
         return Sim3.identity()

@@ -25,7 +25,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import TrackingError
 from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
-from list3r.reconstruction.sfm.fill import PosedSegment
+from list3r.reconstruction.sfm.frame_poses import PosedSegment
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 
 FILES = {"aliked": "aliked/aliked-t16.pth"}

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.peers.graph_weights import PlainWeightSettings, peer_weights
 from list3r.association.graph.edge_information import WeightSettings, information_of
-from list3r.association.graph.growth import extend
+from list3r.association.graph.incremental import extend
 from list3r.association.graph.marginals import marginals
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.graph.solver import GraphProblem

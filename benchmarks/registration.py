@@ -118,7 +118,7 @@ class Home:
         from list3r.pipeline.settings import AssociationSettings
 
         usual = AssociationSettings()
-        alone = replace(usual.revisits, things=replace(usual.revisits.things, enabled=False))
+        alone = replace(usual.revisits, instances=replace(usual.revisits.instances, enabled=False))
         settings = replace(usual, revisits=alone)
         kind = self.runs[0][0].scale_kind
         truth: dict[int, Any] = {}

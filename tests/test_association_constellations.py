@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from list3r.association.revisits.constellations.chunk_registration import (
+    ConstellationRegistrationSettings,
+    log_odds,
+    refusal,
+)
 from list3r.association.revisits.constellations.constellation import Constellation
 from list3r.association.revisits.constellations.matching import MatchingSettings, likeness, match_constellations
-from list3r.association.revisits.constellations.registration import ConstellationRegistrationSettings, log_odds, refusal
 from list3r.association.revisits.constellations.surface_fit import (
     ChunkSurfaces,
     KnownRelation,
@@ -17,7 +21,7 @@ from list3r.association.revisits.constellations.surface_fit import (
     fit_surfaces,
 )
 from list3r.association.revisits.cross_check import Side
-from list3r.association.revisits.cues import CueSettings, instance_set
+from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3, rotation_exp
 from list3r.memory.records import FrameSamples
@@ -108,7 +112,7 @@ def room(S: Sim3, seed: int) -> ChunkSurfaces:
         confidence=np.ones(3000, np.float32),
         instance=np.full(3000, -1, np.int32),
     )
-    nothing = instance_set([], np.zeros((0, 4, 4)), "", CueSettings())
+    nothing = instance_set([], np.zeros((0, 4, 4)), "", SimilaritySettings())
     return ChunkSurfaces(
         Side(samples, Camera(64, 48, 50, 50, 32, 24), nothing), 2.0 * float(S.scale), SurfaceFitSettings()
     )

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, MeasuredEdge, measure_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, MeasuredEdge, measure_edge
 from list3r.instances.overlays import draw_support, write_support
 from list3r.memory.errors import DegenerateError
 from list3r.memory.geometry import Sim3
@@ -81,7 +81,7 @@ def test_a_mover_over_half_of_the_picture_is_left_out(depth_u: float, depth_v: f
     measured = edge_between(u, v, 0, 1, CAMERA, False)
     assert measured.moving_u == measured.moving_v == {MOVER}
     assert measured.support.removed.mean() > 0.4
-    assert "moves" in measured.edge.reason
+    assert "move" in measured.edge.reason
     assert off(measured.edge.S_v_u) < 0.015
     plain = edge_between(u, v, 0, 1, CAMERA, False, EdgeSettings(instance_aware=False))
     assert off(measured.edge.S_v_u) <= off(plain.edge.S_v_u) + 0.005
@@ -160,7 +160,7 @@ def test_degenerate_overlap_has_a_name() -> None:
     u, v = pair()
     cases = {
         "share 0 frames": (u, replace(v, frame=v.frame + 100, camera_frames=v.camera_frames + 100)),
-        "both chunks placed": (u, replace(v, T_chunk_cam=np.full_like(v.T_chunk_cam, np.nan))),
+        "both chunks posed": (u, replace(v, T_chunk_cam=np.full_like(v.T_chunk_cam, np.nan))),
         "finite": (u, replace(v, points=np.full_like(v.points, np.nan))),
         "confidence above zero": (u, replace(v, confidence=np.zeros_like(v.confidence))),
         "at least 60": (only(u, u.frame == 0), only(v, (v.frame == 0) & (v.pixel < 2000))),
@@ -171,7 +171,7 @@ def test_degenerate_overlap_has_a_name() -> None:
                 edge_between(a, b, 7, 8, CAMERA, False, EdgeSettings(instance_aware=aware))
     with pytest.raises(DegenerateError):
         edge_between(FrameSamples.empty(), FrameSamples.empty(), 7, 8, CAMERA, False)
-    with pytest.raises(DegenerateError, match="stands still"):
+    with pytest.raises(DegenerateError, match="static"):
         edge_between(u, v, 7, 8, CAMERA, False, dynamic_u=range(10))
 
 

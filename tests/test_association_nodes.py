@@ -13,7 +13,7 @@ from list3r.association.graph.chunk_nodes import ChunkNodes, NodeSettings, measu
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.graph.sampled_chunks import SampledChunks
-from list3r.association.overlap.edges import EdgeEnd, measure_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, measure_edge
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples

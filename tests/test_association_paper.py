@@ -14,22 +14,27 @@ from list3r.association.overlap.alignment import AlignmentSettings, align
 from list3r.association.overlap.inconsistency import displacement, inconsistency
 from list3r.association.overlap.regions import EdgeSupportSettings, Regions, confident
 from list3r.association.overlap.shared_points import Pairs
-from list3r.association.revisits.cues import InstanceCues, InstanceSet, compare_instances, loop_score
+from list3r.association.revisits.instance_similarity import (
+    InstanceSet,
+    InstanceSimilarity,
+    compare_instances,
+    loop_score,
+)
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge
 
 
 def test_s_loop_weighs_frames_against_instances() -> None:
-    cues = InstanceCues(s_sem=0.9, s_rel=0.6, pairs=((1, 1),), log_scale=0.0)
+    cues = InstanceSimilarity(s_sem=0.9, s_rel=0.6, pairs=((1, 1),), log_scale=0.0)
     settings = PaperRevisitSettings()
     assert (settings.lambda_, settings.least_score) == (0.5, 0.7)
     assert loop_score(0.8, cues, settings.lambda_) == pytest.approx(1.15)  # 0.5 * 0.8 + 0.5 * (0.9 + 0.6)
     assert loop_score(0.8, cues, 1.0) == pytest.approx(0.8)
     assert loop_score(0.8, cues, 0.0) == pytest.approx(1.5)
     # frames alike at 0.85 and no instance that matches stay below the threshold; two cues of 0.3 pass it
-    assert loop_score(0.85, InstanceCues(0.0, 0.0, (), float("nan")), 0.5) < settings.least_score
-    assert loop_score(0.85, InstanceCues(0.3, 0.3, (), 0.0), 0.5) > settings.least_score
+    assert loop_score(0.85, InstanceSimilarity(0.0, 0.0, (), float("nan")), 0.5) < settings.least_score
+    assert loop_score(0.85, InstanceSimilarity(0.3, 0.3, (), 0.0), 0.5) > settings.least_score
 
 
 def test_s_sem_is_the_mean_cosine_of_mutual_nearest_neighbours() -> None:

@@ -11,8 +11,8 @@ from scipy.stats import chi2
 from benchmarks.peers.graph_weights import PlainWeightSettings, peer_weights
 from list3r.association.graph.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
 from list3r.association.graph.edge_information import WeightSettings, support_of
-from list3r.association.graph.growth import extend
-from list3r.association.graph.loop_trust import Tree, chain_squares
+from list3r.association.graph.edge_trust import Tree, chain_squares
+from list3r.association.graph.incremental import extend
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.graph.solver import GraphProblem, adjoint
 from list3r.memory.errors import DegenerateError
@@ -153,7 +153,7 @@ def test_a_loop_that_moves_the_map_moves_all_of_it() -> None:
 
 @pytest.mark.parametrize(("loops", "stated"), [(30, 1.0), (30, 0.7), (0, 1.0)])
 def test_true_positions_lie_inside_the_stated_region(loops: int, stated: float) -> None:
-    exact = GraphSettings(weights=WeightSettings(bend=1e-6, own_bend=0.0))
+    exact = GraphSettings(weights=WeightSettings(bending=1e-6, own_bending=0.0))
     inside = []
     for seed in range(10):
         truth, edges = graph(seed + 20, loops=loops, stated=stated)

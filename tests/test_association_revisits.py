@@ -289,7 +289,7 @@ def test_things_tell_which_of_two_places_that_frames_say_is_right(here: Keyframe
     between = Edge(0, 1, "adjacent", apart, **said)
     told = Edge(1, 3, "loop", Sim3.from_matrix(GAUGE), **said)
     twin, elsewhere = replace(here, frame_index=100), keyframes_at(3.0, first=150)
-    with patch("list3r.association.revisits.search.ThingSearch.edges", return_value=[told]):
+    with patch("list3r.association.revisits.search.InstanceSearch.edges", return_value=[told]):
         edges = find_loops(Chunks([(here,), (twin,), elsewhere, (again,)], known=[between]), 3)
     assert {e.u for e in edges if e.accepted} == {1}
     assert any(e.accepted and e is not told for e in edges)

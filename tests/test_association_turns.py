@@ -13,7 +13,7 @@ from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.overlap.camera_edge import camera_edge
 from list3r.memory.geometry import Sim3, umeyama
 from list3r.memory.records import Edge, FrameSamples
-from list3r.reconstruction.turns import lost_scale
+from list3r.reconstruction.scale_loss import lost_scale
 
 TURN = (60, 80)
 """Frames in which the camera turns by 90 degrees; before and after it walks sideways, 2 cm a frame."""

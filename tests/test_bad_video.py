@@ -113,7 +113,7 @@ def test_a_chunk_that_stands_still_takes_the_pose_of_its_neighbours(tmp_path: Pa
     S = umeyama(found, truth, with_scale=True)
     assert np.linalg.norm(S.apply(found) - truth, axis=1).max() < 0.03
     alone = process_parts(replace(task, shot=(14, 30)))[0]
-    assert not alone.posed.any() and "stands still" in alone.lost_reason
+    assert not alone.posed.any() and "does not move" in alone.lost_reason
 
 
 @pytest.mark.parametrize("focal", [CAMERA.fx, 1.2 * CAMERA.width], ids=["known", "guessed"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from list3r.association.revisits.overlays import compare, draw_loop, write_loop
+from list3r.association.revisits.loop_overlay import compare, draw_loop, write_loop
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, Keyframe
 from tests.association_scenes import CAMERA, film

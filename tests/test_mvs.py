@@ -14,11 +14,11 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.geometry import rotation_exp
 from list3r.reconstruction.mvs import sweep
 from list3r.reconstruction.mvs.fill import fill_regions
-from list3r.reconstruction.mvs.fusion import DepthMap, carry, fill_flat, rims_out
+from list3r.reconstruction.mvs.fusion import DepthMap, fill_flat, project_depth, rims_out
 from list3r.reconstruction.mvs.images import Warp, box_sum, look_up
 from list3r.reconstruction.mvs.settings import DepthFusionSettings, RegionFillSettings, SweepSettings, SweepViewSettings
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, plane_residual, stereo_noise
-from list3r.reconstruction.mvs.views import choose_carried, choose_sources, pair_views, plane_depths, seen_parts
+from list3r.reconstruction.mvs.views import choose_projected, choose_sources, pair_views, plane_depths, seen_parts
 from tests.rgbd_scenes import BOXES, CAMERA, black, frames_along, render, walk
 
 COUNT = 20
@@ -227,10 +227,10 @@ def test_depth_is_taken_over_from_close_looks_and_from_what_sees_the_rest() -> N
     posed, depth, keys = np.ones(12, bool), np.repeat([1.0, 4.0], (8, 4)), [*range(8), 9, 10]
     overlap = pair_views(keys, posed, T, CAMERA, depth).overlap[:, 11]
     parts = seen_parts(keys, posed, T, CAMERA, depth)[11]
-    chosen = choose_carried(overlap, parts, np.array([11 - k for k in keys]), DepthFusionSettings())
+    chosen = choose_projected(overlap, parts, np.array([11 - k for k in keys]), DepthFusionSettings())
     assert overlap.min() == 1.0 and parts[:8].mean() < 0.3 and parts[8:].all()
     assert len(chosen) == 6 and {8, 9} <= set(chosen)
-    assert choose_carried(np.zeros(0), np.zeros((0, 20), bool), np.zeros(0, int), DepthFusionSettings()) == []
+    assert choose_projected(np.zeros(0), np.zeros((0, 20), bool), np.zeros(0, int), DepthFusionSettings()) == []
 
 
 def test_who_steps_back_sees_depth_all_the_way() -> None:
@@ -352,9 +352,12 @@ def test_depth_is_carried_to_where_it_is_seen_and_the_nearest_counts() -> None:
     near = DepthMap(torch.from_numpy(inverse), torch.from_numpy(np.where(inverse > 0, 0.01, 0).astype(np.float32)))
     far = DepthMap(torch.full((30, 40), 0.25), torch.full((30, 40), 0.001))
     stay = Warp.between(np.eye(4), np.eye(4), camera, "cpu")
-    seen = carry([near, far], [stay, stay], DepthFusionSettings())
+    seen = project_depth([near, far], [stay, stay], DepthFusionSettings())
     torch.testing.assert_close(seen.inverse, torch.where(near.inverse > 0, 0.5, 0.25))
     torch.testing.assert_close(seen.sigma, torch.where(near.inverse > 0, 0.01, 0.001))
     back = np.eye(4)
     back[2, 3] = -2.0  # two units behind what was at 2 units
-    assert carry([near], [Warp.between(np.eye(4), back, camera, "cpu")], DepthFusionSettings()).inverse.max() == 0.25
+    assert (
+        project_depth([near], [Warp.between(np.eye(4), back, camera, "cpu")], DepthFusionSettings()).inverse.max()
+        == 0.25
+    )

@@ -183,7 +183,7 @@ def test_a_frame_is_described_by_its_class_token_and_its_pooled_tokens(
     pooled = np.cbrt((flat**3).mean(axis=0))
     for part, whole in ((found[:32], token), (found[32:], pooled)):
         np.testing.assert_allclose(part, whole / np.linalg.norm(whole) / np.sqrt(2), atol=1e-5)
-    by = KeyframeNetworks(look=look)
+    by = KeyframeNetworks(frame_descriptor=look)
     few = replace(reconstruction, keyframes=np.array([0, 5]))
     kept = make_keyframes(frames, few, False, networks=by)
     np.testing.assert_allclose(kept[0].descriptor, found, atol=1e-6)

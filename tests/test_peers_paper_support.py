@@ -12,8 +12,8 @@ from benchmarks.peers.paper_support import (
     sampled,
     without_large_delta,
 )
-from list3r.association.overlap import edges
-from list3r.association.overlap.edges import EdgeEnd, EdgeSettings
+from list3r.association.overlap import overlap_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings
 from list3r.association.overlap.shared_points import Pairs
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
@@ -81,11 +81,11 @@ def test_an_edge_is_measured_so_where_its_settings_say_it() -> None:
     v = FrameSamples(*_samples(truth.apply(p), pixel))
     as_written = EdgeSettings(support=SETTINGS)
     with paper_merging():
-        found = edges.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False, as_written).edge
-        ours = edges.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False).edge
+        found = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False, as_written).edge
+        ours = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False).edge
     assert np.allclose(found.S_v_u.as_matrix(), truth.as_matrix(), atol=1e-5)
     assert found.confidence == pytest.approx(1.0, abs=1e-4)
-    plain = edges.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False).edge
+    plain = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False).edge
     assert np.array_equal(ours.S_v_u.as_matrix(), plain.S_v_u.as_matrix())
 
 

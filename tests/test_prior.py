@@ -16,10 +16,10 @@ from list3r.pipeline.session import check_buildable, resolve_settings
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion import residuals
-from list3r.reconstruction.prior import PriorSettings, bridged, mean_alignment, source_from_chunk, steady_runs
+from list3r.reconstruction.pose_prior import PriorSettings, bridged, mean_alignment, source_from_chunk, steady_runs
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.odometry import CameraTracker, TrackedSegment
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
 from list3r.reconstruction.rgbd.view import make_view

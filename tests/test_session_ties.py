@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from list3r.association.revisits.second_looks import SecondLookSettings, seeing_the_same
-from list3r.association.revisits.session_ties import hold_back
+from list3r.association.revisits.further_pairs import FurtherPairSettings, similar_views
+from list3r.association.revisits.session_edges import defer_session_edges
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, FrameSamples
 from list3r.memory.world.session_ties import SessionTies, counted_once
@@ -25,21 +25,21 @@ def _edge(u: int, v: int, kind: str = "loop", off_m: float = 0.0, features: floa
 
 
 def _accepted(edges: list[Edge], sessions: dict[int, int] | None = None) -> list[bool]:
-    return [e.accepted for e in hold_back(edges, sessions or CHUNKS)]
+    return [e.accepted for e in defer_session_edges(edges, sessions or CHUNKS)]
 
 
 INSIDE = [_edge(1, 2, "adjacent"), _edge(3, 4, "adjacent"), _edge(5, 6, "adjacent")]
 
 
 def test_one_weak_relation_does_not_place_a_session() -> None:
-    out = hold_back([*INSIDE, _edge(1, 3)], CHUNKS)
+    out = defer_session_edges([*INSIDE, _edge(1, 3)], CHUNKS)
     assert [e.accepted for e in out] == [True, True, True, False]
-    assert "held back" in out[3].reason
+    assert "deferred" in out[3].reason
 
 
 def test_two_that_agree_do_and_release_what_was_held() -> None:
-    held = hold_back([*INSIDE, _edge(1, 3)], CHUNKS)[3]
-    out = hold_back([*INSIDE, held, _edge(2, 4)], CHUNKS)
+    held = defer_session_edges([*INSIDE, _edge(1, 3)], CHUNKS)[3]
+    out = defer_session_edges([*INSIDE, held, _edge(2, 4)], CHUNKS)
     assert all(e.accepted for e in out)
     assert out[3].reason == "measured"
 
@@ -70,11 +70,11 @@ def test_a_relation_says_which_other_keyframes_see_the_same() -> None:
     empty = FrameSamples.empty()
     u, v = (replace(empty, camera_frames=frames, T_chunk_cam=poses) for poses in (T, moved))
     edge = replace(_edge(1, 3), S_v_u=S, frames=(10, 10))
-    found = seeing_the_same(edge, (u, v), (frames.tolist(), frames.tolist()), SecondLookSettings(most=8))
+    found = similar_views(edge, (u, v), (frames.tolist(), frames.tolist()), FurtherPairSettings(most=8))
     assert len(found) == 8 and {a - b for a, b in found} == {0}
     assert min(abs(a - 10) for a, _ in found) == 10  # 10 on either side, 20 on both
-    near = SecondLookSettings(most=99, turn_deg=31.0)
-    apart = seeing_the_same(edge, (u, v), (frames.tolist(), frames.tolist()), near)
+    near = FurtherPairSettings(most=99, turn_deg=31.0)
+    apart = similar_views(edge, (u, v), (frames.tolist(), frames.tolist()), near)
     assert {abs(a - b) for a, b in apart} == {0, 5, 55}
 
 
@@ -106,7 +106,7 @@ def test_the_order_of_edges_does_not_matter(order: tuple[int, ...]) -> None:
 
 def test_a_memory_of_one_session_is_left_as_it_is() -> None:
     edges = [_edge(1, 2), _edge(3, 4)]
-    assert hold_back(edges, dict.fromkeys(CHUNKS, 1)) == edges
+    assert defer_session_edges(edges, dict.fromkeys(CHUNKS, 1)) == edges
 
 
 def test_one_that_the_depth_contradicts_is_not_beyond_doubt() -> None:

@@ -14,7 +14,7 @@ from list3r.frames.chunking.borrowing import frames_around
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.geometry import umeyama
 from list3r.reconstruction.sfm.consistency import contradicted
-from list3r.reconstruction.sfm.links import step_beside
+from list3r.reconstruction.sfm.links import context_step
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, agreed, build_maps, first_pairs
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 from list3r.reconstruction.sfm.settings import LinkSettings, MappingSettings
@@ -97,7 +97,7 @@ def test_the_faster_the_picture_changes_the_nearer_are_the_frames_around(
     tracks = CornerTracks(
         none, nowhere, tuple(range(keyframes)), np.zeros(frames, np.int64), np.zeros(frames, np.float32)
     )
-    assert step_beside(tracks, LinkSettings()) == step
+    assert context_step(tracks, LinkSettings()) == step
 
 
 def sized(keyframes: int, error_px: float) -> list[SparseMap]:
@@ -126,7 +126,7 @@ def test_maps_are_also_grown_from_what_shares_most_in_the_second_and_the_last_th
     steps = {(a, b): np.zeros((200 - (b - a), 2), np.int64) for a in keys for b in keys if a < b <= a + 20}
     steps[24, 34] = steps[50, 58] = np.zeros((500, 2), np.int64)  # five and four keyframes on
     steps[30, 32] = steps[4, 14] = steps[52, 100] = np.zeros((900, 2), np.int64)  # next, first third, not its own
-    problem = MapProblem({**dict.fromkeys(keys, none), 100: none}, steps, beside=frozenset([100]))
+    problem = MapProblem({**dict.fromkeys(keys, none), 100: none}, steps, context=frozenset([100]))
     assert first_pairs(problem, MappingSettings()) == [(24, 34), (50, 58)]
     assert first_pairs(MapProblem(dict.fromkeys(range(3), none), {}), MappingSettings()) == []
 
@@ -147,6 +147,6 @@ def test_views_beside_are_in_no_map() -> None:
     rows = np.stack([np.arange(200)] * 2, axis=1)
     pairs = {(a, b): rows for a in range(4) for b in range(a + 1, 4)}
     (whole,) = build_maps(MapProblem(views, pairs), CAMERA)
-    (part,) = build_maps(MapProblem(views, pairs, beside=frozenset({0, 3})), CAMERA)
+    (part,) = build_maps(MapProblem(views, pairs, context=frozenset({0, 3})), CAMERA)
     assert sorted(whole.T_map_cam) == [0, 1, 2, 3] and sorted(part.T_map_cam) == [1, 2]
     assert set(part.seen) <= {1, 2}

@@ -81,7 +81,7 @@ def test_the_camera_is_the_same_wherever_its_windows_are_mapped(pictures: Path) 
 
 def test_nothing_is_left_of_a_video_that_cannot_be_followed(tmp_path: Path):
     folder = save(tmp_path / "still", [pose(0)] * 5)
-    with pytest.raises(TrackingError, match="stands still"):
+    with pytest.raises(TrackingError, match="does not move"):
         build(folder, tmp_path / "still.l3r", settings=BuildSettings("auto", "auto"), run=RunOptions(workers=1))
 
 

@@ -18,7 +18,7 @@ from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.consistency import contradicted, epipolar_errors
-from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.frame_poses import PosedSegment, pose_segments
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, likely_pairs, make_finder, match_features
 from list3r.reconstruction.sfm.links import keyframe_problem
 from list3r.reconstruction.sfm.mapping import build_maps
@@ -139,7 +139,7 @@ def test_keyframes_known_by_features_alone_keep_their_poses():
     problem = keyframe_problem(apart, grays)
     assert problem.matched == frozenset(problem.pairs)
     maps = build_maps(problem, CAMERA, settings=SfmSettings().mapping)
-    segment = fill_segments(maps, apart, grays)[0]
+    segment = pose_segments(maps, apart, grays)[0]
     assert sorted(segment.T_map_cam) == list(range(FRAMES // 3))
     assert min(len(xy) for xy, _ in segment.seen.values()) >= 20
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.poses import angle_deg, small_motion
-from list3r.reconstruction.sfm.fill import pose_of
+from list3r.reconstruction.sfm.frame_poses import pose_of
 from list3r.reconstruction.sfm.kernels import pose_equations
 from list3r.reconstruction.sfm.settings import FramePoseSettings
 

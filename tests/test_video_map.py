@@ -114,8 +114,8 @@ def test_a_false_revisit_is_distrusted_where_others_contradict_it() -> None:
 def test_a_revisit_that_the_way_between_contradicts_is_none() -> None:
     elsewhere = ring()
     elsewhere[12:, :3, 3] += (3.0, 0.0, 0.0)
-    looks = [replace(v, look=np.ones(4, np.float32)) for v in views(elsewhere)]
-    assert not find_revisits(looks, CAMERA, RevisitPairSettings(apart=20))[0]
+    twins = [replace(v, descriptor=np.ones(4, np.float32)) for v in views(elsewhere)]
+    assert not find_revisits(twins, CAMERA, RevisitPairSettings(apart=20))[0]
 
 
 def test_a_place_comes_back_only_where_it_was_out_of_sight_between() -> None:

@@ -35,7 +35,7 @@ class PlainWeightSettings(WeightSettings):
 def peer_weights() -> Iterator[None]:
     """Let graphs with these settings be weighted by them, and all others as they are."""
     with ExitStack() as stack:
-        for module in ("pose_graph", "growth", "node_graph"):
+        for module in ("pose_graph", "incremental", "node_graph"):
             stack.enter_context(patch(f"list3r.association.graph.{module}.information_of", _information))
         yield
 

@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.peers.plain_alignment import plain_align, plain_support
 from list3r.association.overlap.alignment import Alignment
 from list3r.association.overlap.balance import BalancedSupport, balanced_support
-from list3r.association.overlap.edges import EdgeSettings
 from list3r.association.overlap.inconsistency import displacement
+from list3r.association.overlap.overlap_edge import EdgeSettings
 from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confident
 from list3r.association.overlap.shared_points import Pairs
 from list3r.association.overlap.support import Fit, StaticSupport, static_support
@@ -44,7 +44,7 @@ class PaperSupportSettings(EdgeSupportSettings):
 @contextmanager
 def paper_merging() -> Iterator[None]:
     """Let edges with `PaperSupportSettings` be measured as the paper writes it, and all others as they are."""
-    edges = "list3r.association.overlap.edges"
+    edges = "list3r.association.overlap.overlap_edge"
     with ExitStack() as stack:
         for name, function in (("static_support", _static), ("balanced_support", _sampled), ("align_support", _align)):
             stack.enter_context(patch(f"{edges}.{name}", function))

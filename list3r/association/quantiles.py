@@ -6,10 +6,10 @@ from scipy.special import fdtri, gammaincinv
 
 
 def chi2_quantile(probability: float, freedom: float) -> float:
-    """Return the value that a chi-square variable with `freedom` degrees of freedom stays below with `probability`."""
+    """Return the value that a chi-square variable with `freedom` degrees of freedom is below with `probability`."""
     return 2.0 * float(gammaincinv(freedom / 2, probability))
 
 
 def f_quantile(probability: float, freedom: float, freedom_below: float) -> float:
-    """Return the value that an F variable (`freedom` over `freedom_below` degrees) stays below with `probability`."""
+    """Return the value that an F variable (`freedom` over `freedom_below` degrees) is below with `probability`."""
     return float(fdtri(freedom, freedom_below, probability))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.overlap.edges import MeasuredEdge
+from list3r.association.overlap.overlap_edge import MeasuredEdge
 from list3r.frames.base import Camera, Frame
 from list3r.frames.decoding.decode import decode_picture
 from list3r.memory.masks import decode_mask

@@ -13,7 +13,7 @@ from list3r.memory.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.instances.neural.appearance import Appearance
-    from list3r.reconstruction.keyframe_record import FrameLook
+    from list3r.reconstruction.keyframe_record import FrameDescriptor
 
 DISCOVERERS = ("learned", "eomt", "mask2former", "sam2", "sam3", "precomputed")
 TRACKERS = ("reprojection", "sam2", "sam3", "edgetam")
@@ -64,7 +64,7 @@ def make_discoverer(
     return WithAppearance(found, _appearance(features, where[f"features/{features}"], device))
 
 
-def make_frame_look(features: str, folders: tuple[tuple[str, str], ...], device: str) -> FrameLook | None:
+def make_frame_look(features: str, folders: tuple[tuple[str, str], ...], device: str) -> FrameDescriptor | None:
     """What describes whole frames by the network of that name, the one that describes things; None where it is none.
 
     Raises `OptionError`.

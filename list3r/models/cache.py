@@ -1,8 +1,8 @@
-"""The cache of the Hugging Face hub: what is in it, how large, at which commit, and how weights come into it.
+"""The cache of the Hugging Face hub: its contents, their size and commit, and downloads into it.
 
-The cache's own layout is read as it lies on the disk (`models--owner--name/refs|snapshots`), so that looking needs
-neither network nor package. What was fetched once is used from then on: the name of a branch stands for the commit
-that the cache holds of it, and nothing asks the network again.
+The cache's own layout on the disk is read (`models--owner--name/refs|snapshots`), so that looking needs neither network
+nor package. Fetched weights are used from then on: the name of a branch means the commit that the cache holds of
+it, and nothing asks the network again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from list3r.models.cards import UNPINNED, Weights
 CONFIG = "config.json"
 SINGLE_FILES = (".safetensors", ".pt", ".pth", ".bin")
 OLD_FILES = ("*.bin", "*.pt", "*.pth")
-"""Fetched only where there is nothing newer; read without running what they hold."""
+"""Fetched only where there is nothing newer; read without running their code."""
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _MAX_HEADER = 100 * 2**20
@@ -50,7 +50,7 @@ class Cached:
 
 
 def cache_folder() -> Path:
-    """Return where the hub keeps what was fetched, by the environment variables that its own package obeys."""
+    """Return the hub's cache folder, by the environment variables of its own package."""
     if "HF_HUB_CACHE" in os.environ:
         return Path(os.environ["HF_HUB_CACHE"]).expanduser()
     base = os.environ.get("XDG_CACHE_HOME", "~/.cache")
@@ -58,7 +58,7 @@ def cache_folder() -> Path:
 
 
 def find_cached(repository: str, revision: str = UNPINNED) -> Cached | None:
-    """Return what the cache holds of a repository at a revision; None where nothing, or no weights, are there."""
+    """Return the cached commit of a repository at a revision; None without one that has weights."""
     base = cache_folder() / f"models--{repository.replace('/', '--')}"
     commit = revision
     if not _COMMIT.fullmatch(revision):
@@ -110,7 +110,7 @@ def locate(name: str) -> Path:
 
 
 def fetch(weights: Weights, revision: str | None = None) -> Cached:
-    """Bring weights into the cache, with progress on standard error; what is there already is not loaded again.
+    """Bring weights into the cache, with progress on standard error; cached files are not loaded again.
 
     Raises `OptionError` when the hub cannot be reached, does not know them, or wants the user to be granted access.
     """

@@ -1,8 +1,8 @@
-"""What every neural model is: its licence, where its weights lie, what it needs, how much memory it is said to take.
+"""Every neural model: its licence, the place of its weights, its needs, and its published memory.
 
 A card names facts that others published; nothing here loads a model. Code and weights have licences of their own, and
-both count. A revision is a commit that public pages name; where none does the weights are `unpinned`, and what was
-fetched is used from then on (`cache`).
+both count. A revision is a commit that public pages name; where none does the weights are `unpinned`, and the fetched
+commit is used from then on (`cache`).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from list3r.memory.errors import OptionError, install_hint
 
 PARTS = ("geometry", "discovery", "tracking", "features", "text", "detector", "local features", "descriptor")
-"""What a model can be in a pipeline."""
+"""The parts of a pipeline that a model can serve."""
 
 UNPINNED = "main"
-"""Name of the branch that stands where no revision is known."""
+"""Branch used where no revision is known."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Weights:
     files: tuple[str, ...] = ("*.json", "*.safetensors", "*.txt", "*.model")
     """Patterns of the files that are needed."""
     memory: MemoryFigures | None = None
-    """Where these need another than the card says."""
+    """Set where these need another amount than the card states."""
 
     @property
     def pinned(self) -> bool:
@@ -92,12 +92,12 @@ class ModelCard:
     packages: tuple[str, ...]
     """Modules that must be importable."""
     install: str
-    """The command that installs them; further packages beside those of `extra`, where that is given."""
+    """The command that installs them; packages in addition to `extra`, where that is given."""
     memory: MemoryFigures | None = None
     pixels: int = 0
     """Pixels of its pictures, at most, where `memory` is known."""
     about: str = ""
-    """One line on what it is good for."""
+    """One line on its use."""
     extra: str | None = None
     """Extra of this program that brings them."""
 
@@ -105,7 +105,7 @@ class ModelCard:
         assert self.part in PARTS
 
     def memory_with(self, weights: str | None) -> MemoryFigures | None:
-        """Published memory with weights named `owner/name` or `owner/name@revision`; None stands for the first ones."""
+        """Published memory with weights named `owner/name` or `owner/name@revision`; None means the first ones."""
         if weights is None:
             known = self.weights[0] if self.weights else None
         else:
@@ -157,7 +157,7 @@ CARDS: tuple[ModelCard, ...] = (
         (Weights("yyfz233/Pi3X", CC_BY_NC, revision="bb1deea4d7423de5b30691739cb451a3f57dc1d5"),),
         ("pi3",),
         f"{_GIT}/yyfz/Pi3",
-        MemoryFigures(5190, 212, "its authors' capacity table, A800, bfloat16, and the weights for what can be told"),
+        MemoryFigures(5190, 212, "its authors' capacity table, A800, bfloat16, and the weights for known inputs"),
         255_000,
         "smoother than pi3, takes known intrinsics and poses",
     ),
@@ -300,7 +300,7 @@ CARDS: tuple[ModelCard, ...] = (
         Weights("openai/clip-vit-base-patch32", MIT, revision="3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268"),
         "free words in find and nearest",
     ),
-    ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of things"),
+    ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of objects"),
     ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", about="learned local features"),
 )
 """Every model that has an adapter here. Weights that a card does not name are the user's own (`--weights`)."""
@@ -320,5 +320,5 @@ def cards_named(name: str) -> list[ModelCard]:
 
 
 def find_weights(card: ModelCard, repository: str) -> Weights | None:
-    """Return what is known of a repository of weights, None for one that the card does not name."""
+    """Return the card's entry for a repository of weights, None for one that the card does not name."""
     return next((w for w in card.weights if w.repository.lower() == repository.lower()), None)

@@ -60,7 +60,7 @@ def check_package(card: ModelCard) -> None:
 
 
 def pinned_weights(selection: ModelSelection, asked: Mapping[str, str], profile: str) -> dict[str, str]:
-    """The weights of every model, by option, as a path or `owner/name@commit`; what is not in the cache is fetched.
+    """The weights of every model, by option, as a path or `owner/name@commit`; missing ones are fetched.
 
     Nothing is fetched before all of them are allowed. Raises `OptionError` as `check_allowed` and `cache.resolve` do.
     """

@@ -1,4 +1,4 @@
-"""The GPU: what it is, what is free on it, how many pictures fit, and what to do when they do not."""
+"""The GPU: its name, its free memory, how many pictures fit, and what to do when they do not."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def out_of_memory_reported(what: str) -> Iterator[None]:
-    """Turn memory that runs out into an `OptionError` that says for what it was needed."""
+    """Turn memory that runs out into an `OptionError` that names its use."""
     try:
         yield
     except Exception as error:
@@ -65,9 +65,9 @@ def pictures_that_fit(free_mb: float, figures: MemoryFigures, pixels: int) -> in
 
 
 class MemoryBudget:
-    """How many pictures one pass may hold: published figures at first, what was measured from then on.
+    """How many pictures one pass may hold: published figures at first, measured ones from then on.
 
-    On a CPU there is no limit but the one that running out of memory teaches.
+    On a CPU the only limit is learned from running out of memory.
     """
 
     def __init__(self, figures: MemoryFigures | None, free_mb: float | None, pixels: int) -> None:
@@ -87,7 +87,7 @@ class MemoryBudget:
     def measured(self, pictures: int, peak_mb: float, weights_mb: float) -> None:
         """A pass over this many took `peak_mb` in all, `weights_mb` of it for the weights: correct the figures by it.
 
-        A pass over a handful of pictures says too little of a long one, so it is not believed.
+        A pass over a handful of pictures predicts a long one badly, so it is not used.
         """
         if self._free_mb is None or pictures < 8 or peak_mb <= weights_mb:
             return

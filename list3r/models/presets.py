@@ -1,4 +1,4 @@
-"""Which models run together: presets by name, and `auto`, which looks at the machine."""
+"""Which models run together: presets by name, and `auto`, which depends on the machine."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 RENAMED = {"Sam3TrackerModel": {r"^tracker_model\.": ""}}
-"""What layers are called otherwise in published weights, by class, where transformers 5.23 does not know it:
+"""Layer names to replace in published weights, by class, where transformers 5.23 does not know them:
 facebook/sam3 is one checkpoint of a detector and a tracker."""
 
 
@@ -38,7 +38,7 @@ def pick_device(name: str) -> torch.device:
 def load_named(
     kinds: Mapping[str, str], option: str, name: str, folder: Path, device: str, *, exact: bool = False
 ) -> tuple[Any, torch.device]:
-    """Return the network that a model's name stands for, by its class, and the device that it lies on.
+    """Return the network of a model's name, by its class, and its device.
 
     `exact` keeps it in float32 everywhere, for networks that half precision breaks.
     Raises `OptionError` as `pick_device` and `load_pretrained` do, and for a name that is none of the kinds.

@@ -1,4 +1,4 @@
-"""Loads a network whose class comes with its authors' own package and whose weights lie in a folder or one file."""
+"""Loads a network whose class is in its authors' own package and whose weights are in a folder or one file."""
 
 from __future__ import annotations
 

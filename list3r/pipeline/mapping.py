@@ -9,10 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from list3r.association.overlap.camera_edge import better_edge, camera_edge, in_one_frame, one_frame_edge
-from list3r.association.overlap.edges import EdgeEnd, measure_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, measure_edge
 from list3r.association.overlap.prior_edge import prior_edge
 from list3r.association.revisits.joint_window import JointReconstructor
-from list3r.association.revisits.overlays import write_loop
+from list3r.association.revisits.loop_overlay import write_loop
 from list3r.association.revisits.reprojection_edge import ReprojectionSettings, refine_loop
 from list3r.association.revisits.search import find_loops
 from list3r.frames.base import Camera

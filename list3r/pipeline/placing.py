@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.chunk_nodes import NodeSettings
-from list3r.association.graph.growth import extend
+from list3r.association.graph.incremental import extend
 from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.surface_graph import place_by_surfaces
 from list3r.association.overlap.camera_edge import in_one_frame
-from list3r.association.revisits.session_ties import hold_back
+from list3r.association.revisits.session_edges import defer_session_edges
 from list3r.memory.bends import Bend
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge
@@ -51,7 +51,7 @@ def place_chunks(
         return
     measured = store.edges.all()
     session_of = {c.chunk_id: c.session_id for c in store.chunks.all()}
-    edges = hold_back(measured, session_of, _metre(chunks), how.ties)
+    edges = defer_session_edges(measured, session_of, _metre(chunks), how.ties)
     ids = [c.chunk_id for c in chunks]
     metric = all(c.scale_kind == "metric" for c in chunks)
     fitted = new is not None and len(chunks) > how.solved_whole

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from list3r.association.revisits.session_ties import HELD
+from list3r.association.revisits.session_edges import DEFERRED
 from list3r.memory.records import Edge, FrameRow, JsonFields
 from list3r.memory.store.store import Store
 from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
@@ -171,9 +171,9 @@ def ties(store: Store, session: int) -> list[Edge]:
 
 
 def held(store: Store, session: int) -> int:
-    """How many relations of a session to earlier ones are held back, see `association.session_ties`."""
+    """How many relations of a session to earlier ones are deferred, see `association.revisits.session_edges`."""
     owner = {c.chunk_id: c.session_id for c in store.chunks.all()}
-    return sum(HELD in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges.all())
+    return sum(DEFERRED in e.scores and owner[e.u] < owner[e.v] == session for e in store.edges.all())
 
 
 def _build_notes(store: Store, session: int, lost: int, components: int) -> tuple[str, ...]:

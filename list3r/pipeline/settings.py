@@ -9,12 +9,12 @@ from list3r.association.graph.chunk_nodes import NodeSettings
 from list3r.association.graph.pose_graph import GraphSettings
 from list3r.association.graph.surface_graph import SurfaceSettings
 from list3r.association.overlap.camera_edge import CameraEdgeSettings
-from list3r.association.overlap.edges import EdgeSettings
 from list3r.association.overlap.motion import MotionSettings
+from list3r.association.overlap.overlap_edge import EdgeSettings
 from list3r.association.overlap.prior_edge import PriorEdgeSettings
 from list3r.association.revisits.reprojection_edge import ReprojectionSettings
 from list3r.association.revisits.search import RevisitSettings
-from list3r.association.revisits.session_ties import TieSettings
+from list3r.association.revisits.session_edges import SessionEdgeSettings
 from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.frames.chunking.borrowing import BorrowSettings
 from list3r.frames.chunking.chunks import ChunkSettings
@@ -41,7 +41,7 @@ class AssociationSettings:
     """Of edges by poses that the source gives as a prior."""
     reprojection: ReprojectionSettings = field(default_factory=ReprojectionSettings)
     """Of loops of such models."""
-    ties: TieSettings = field(default_factory=TieSettings)
+    ties: SessionEdgeSettings = field(default_factory=SessionEdgeSettings)
     graph: GraphSettings = field(default_factory=GraphSettings)
     nodes: NodeSettings = field(default_factory=NodeSettings)
     surfaces: SurfaceSettings = field(default_factory=SurfaceSettings)

@@ -1,4 +1,4 @@
-"""The border of every reconstruction model: frames in, poses and depth with confidence out."""
+"""The interface of every reconstruction model: frames in, poses and depth with confidence out."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """How rough depth is that a model computed: standard deviation base + quadratic * z^2, chunk units.
+    """Noise of depth that a model computed: standard deviation base + quadratic * z^2, chunk units.
 
-    Frames share their errors, so that neither their agreement nor their mean tells more than one of them.
+    Frames share their errors, so neither their agreement nor their mean is more accurate than one frame.
     """
 
     base: float
     quadratic: float
     half_share: float = 0.0
-    """Deviation, as a share of depth, at which confidence is one half; 0 where confidence does not tell."""
+    """Deviation, as a share of depth, at which confidence is one half; 0 where confidence says nothing of it."""
 
     def scaled(self, scale: float) -> DepthNoise:
-        """Return the same where a unit is `scale` units of before."""
+        """Return the same noise where a new unit is `scale` former units."""
         return DepthNoise(self.base * scale, self.quadratic / scale, self.half_share)
 
     def sigma(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -61,7 +61,7 @@ class DepthNoise:
         return np.asarray(self.base + self.quadratic * depth * depth, np.float32)
 
     def doubt(self, depth: NDArray[np.float32], confidence: NDArray[np.float16]) -> NDArray[np.float32]:
-        """Standard deviation that confidence tells, chunk units: what bends a whole surface is in it. Shape (...).
+        """Standard deviation by confidence, chunk units; it includes deformation of whole surfaces. Shape (...).
 
         Confidence is 1 / (1 + (sigma / half)^2).
         """
@@ -76,7 +76,7 @@ class PosedOnly:
     frame_indices: NDArray[np.int64]
     """Frame.index of each frame. Shape (M,)."""
     posed: NDArray[np.bool_]
-    """False where the camera could not be followed. Shape (M,)."""
+    """False where the camera was lost. Shape (M,)."""
     T_chunk_cam: NDArray[np.float64]
     """Shape (M, 4, 4)."""
 
@@ -88,7 +88,7 @@ class Reconstruction:
     frame_indices: NDArray[np.int64]
     """Frame.index of each frame. Shape (F,)."""
     posed: NDArray[np.bool_]
-    """False where the camera could not be followed; such a frame's pose means nothing. Shape (F,)."""
+    """False where the camera was lost; such a frame's pose is meaningless. Shape (F,)."""
     T_chunk_cam: NDArray[np.float64]
     """Pose of the colour camera in the chunk. Shape (F, 4, 4)."""
     camera: Camera
@@ -102,12 +102,12 @@ class Reconstruction:
     keyframes: NDArray[np.int64]
     """Positions (into F) of the keyframes, ascending. Shape (K,)."""
     movers: NDArray[np.uint8] | None = None
-    """Number of the thing that moves of its own at every n-th pixel, from 1, and 0 for what stays; None where the model
-    looks for none or nothing moves. Depth and confidence are 0 there. Shape (F, h, w)."""
+    """Number of the mover at every n-th pixel, from 1, and 0 for static pixels; None where the model looks for none or
+    nothing moves. Depth and confidence are 0 on movers. Shape (F, h, w)."""
     depth_noise: DepthNoise | None = None
-    """Noise of depth that was computed; None for a sensor's readings, whose noise is known and new in each frame."""
+    """Noise of computed depth; None for a sensor's readings, whose noise is known and independent by frame."""
     between: PosedOnly | None = None
-    """Further frames of the chunk, none of the above."""
+    """Further frames of the chunk, disjoint from the above."""
 
     def __post_init__(self) -> None:
         count = len(self.frame_indices)
@@ -148,7 +148,7 @@ class WindowSide:
     camera: Camera
     """Of the frames."""
     camera_known: bool
-    """False where the camera is a guess, of which only the size counts."""
+    """False where only the size of the camera is right and the rest is a guess."""
 
 
 @runtime_checkable
@@ -161,7 +161,7 @@ class JointModel(Protocol):
 
 
 def reconstruct_jointly(model: Reconstructor, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
-    """Reconstruct frames of several places in one gauge, as one chunk where the model has no way of its own.
+    """Reconstruct frames of several places in one gauge, as one chunk where the model has no joint mode.
 
     Raises `TrackingError` when a side cannot be posed, or when such a chunk would have several cameras.
     """

@@ -1,4 +1,4 @@
-"""What a chunk keeps of its frames so that others can be placed against it: keyframes and overlap samples."""
+"""The parts of a chunk's frames that are stored to relate other chunks to it: keyframes and overlap samples."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from list3r.reconstruction.features.vlad import describe_frame
 from list3r.reconstruction.rgbd.view import shrink_depth
 from list3r.reconstruction.settings import KeyframeSettings, SampleSettings
 
-FrameLook = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
+FrameDescriptor = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 """A unit descriptor (D,) of a whole picture (H, W, 3)."""
 
 
@@ -29,9 +29,9 @@ class KeyframeNetworks:
     """Networks that describe keyframes."""
 
     detector: LearnedDetector | None = None
-    """Of local features, in the place of SIFT."""
-    look: FrameLook | None = None
-    """Of the whole frame, in the place of its SIFT features' VLAD."""
+    """Of local features, replacing SIFT."""
+    frame_descriptor: FrameDescriptor | None = None
+    """Of the whole frame, replacing the VLAD of its SIFT features."""
 
 
 def make_keyframes(
@@ -63,9 +63,9 @@ def make_keyframes(
 def frames_to_show(
     library: LocalLibrary, reconstruction: Reconstruction, kept: Sequence[int], settings: KeyframeSettings
 ) -> list[int]:
-    """Return the positions of further frames that show instances of which the `kept` ones show too little.
+    """Return the positions of further frames that show instances which the `kept` ones show too little.
 
-    The frame that serves most of them is taken first, of equal ones that which shows most of their surface.
+    The frame that serves most instances is taken first, among equals the one with most of their surface.
     """
     shown = _shown_surfaces(library, reconstruction, settings)
     wanted = settings.shown_share * shown.max(axis=0, initial=0.0)
@@ -83,7 +83,7 @@ def frames_to_show(
 def _shown_surfaces(
     library: LocalLibrary, reconstruction: Reconstruction, settings: KeyframeSettings
 ) -> NDArray[np.float64]:
-    """How much of each instance each posed frame shows. Shape (F, instances)."""
+    """Surface of each instance that each posed frame shows. Shape (F, instances)."""
     place = {int(n): k for k, n in enumerate(reconstruction.frame_indices) if reconstruction.posed[k]}
     out = np.zeros((len(reconstruction.frame_indices), len(library.instances)))
     for column, instance in enumerate(library.instances):
@@ -96,7 +96,7 @@ def _shown_surfaces(
 
 
 def _picture_alone(reconstruction: Reconstruction, position: int, like: Feature) -> Keyframe:
-    """A frame that is kept for its picture alone: nothing is placed against it."""
+    """A frame that is kept for its picture alone: nothing is registered to it."""
     camera = reconstruction.camera
     return Keyframe(
         frame_index=int(reconstruction.frame_indices[position]),
@@ -113,7 +113,7 @@ def _picture_alone(reconstruction: Reconstruction, position: int, like: Feature)
 def frame_samples(
     reconstruction: Reconstruction, library: LocalLibrary | None = None, settings: SampleSettings | None = None
 ) -> FrameSamples:
-    """Points of all posed frames on fixed pixel grids, with the instances whose masks hold them."""
+    """Points of all posed frames on fixed pixel grids, with the instances whose masks contain them."""
     chosen = settings or SampleSettings()
     positions = np.flatnonzero(reconstruction.posed)
     camera = reconstruction.camera
@@ -183,7 +183,7 @@ def _hold(
     owner: NDArray[np.int32],
     area: NDArray[np.int32],
 ) -> None:
-    """Give pixels (N,), ascending, of a mask's run-length code to an instance of an area, where that is less."""
+    """Assign pixels (N,), ascending, of a mask's run-length code to an instance of an area, where that is less."""
     at, stop = 0, np.int64(0)
     for k in range(len(mask)):
         stop += np.int64(mask[k])
@@ -224,10 +224,11 @@ def _make_keyframe(
     if networks.detector is not None:
         found = networks.detector(frame.color, settings.learned_count)
         kept = Features(found.xy, as_bytes(found.descriptors), points_at(found.xy, depth, camera))
+    describe = networks.frame_descriptor
     return Keyframe(
         frame_index=frame.index,
         T_chunk_cam=reconstruction.T_chunk_cam[position].copy(),
-        descriptor=describe_frame(features.descriptors) if networks.look is None else networks.look(frame.color),
+        descriptor=describe(frame.color) if describe else describe_frame(features.descriptors),
         keypoints_xy=kept.xy,
         keypoint_descriptors=kept.descriptors,
         points_cam=kept.points_cam,

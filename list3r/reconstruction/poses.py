@@ -1,4 +1,4 @@
-"""Poses of a chunk: those that the source gives, and which frames are keyframes."""
+"""Poses of a chunk: given ones of the source, and the choice of keyframes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Poses = NDArray[np.float64]
 
 
 def is_rigid(T: Poses) -> bool:
-    """Return whether a 4x4 matrix is a finite rigid transform, to a tolerance that text files keep."""
+    """Return whether a 4x4 matrix is a finite rigid transform, to the precision of text files."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[:3, :3]
@@ -45,7 +45,7 @@ def small_motion(step: NDArray[np.float64]) -> Poses:
 
 
 def angle_deg(T: Poses) -> float:
-    """Return the angle by which a rigid transform turns, degrees."""
+    """Return the rotation angle of a rigid transform, degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
 
 

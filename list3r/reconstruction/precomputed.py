@@ -1,7 +1,7 @@
 """Reconstruction `precomputed`: geometry that some model wrote into a folder, in the layout of `precomputed_files`.
 
-Files may hold a chunk or one frame each. Where the manifest names a chunk length every file has a gauge of its own,
-and frames of several files are joined by the frames that the files share; else all files lie in one world.
+Files may hold a chunk or one frame each. Where the manifest gives a chunk length every file has its own gauge, and
+frames of several files are joined by the frames that the files share; otherwise all files are in one world.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Folder:
 
 @lru_cache(maxsize=4)
 def open_folder(path: Path) -> Folder:
-    """Look at a folder once. Raises `OptionError` for one that is no such folder, or holds no files."""
+    """Read a folder's index. Raises `OptionError` for one that is no such folder, or has no files."""
     if not path.is_dir():
         raise OptionError(f"{path}: no such folder; --reconstruction precomputed reads one (see docs/precomputed.md)")
     manifest = read_manifest(path)
@@ -69,7 +69,7 @@ class PrecomputedReconstructor:
         self._settings = settings or NetworkSettings()
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Return what is known of the frames; those that no file holds are not posed.
+        """Return the stored geometry of the frames; those in no file are not posed.
 
         Raises `TrackingError` when fewer than two are held, `OptionError` for files that are damaged or do not fit.
         """
@@ -83,7 +83,7 @@ class PrecomputedReconstructor:
         return with_given_poses(made, frames) if self._poses == "given" else made
 
     def _gather(self, wanted: NDArray[np.int64]) -> tuple[WindowOutput, DepthNoise | None]:
-        """The answer for the wanted frames, in the gauge of the first file, and its noise."""
+        """The stored output for the wanted frames, in the gauge of the first file, and its noise."""
         output: WindowOutput | None = None
         noises: list[DepthNoise] = []
         filled = np.zeros(len(wanted), bool)
@@ -125,14 +125,14 @@ class PrecomputedReconstructor:
 
 
 def _roughest(noises: Sequence[DepthNoise]) -> DepthNoise | None:
-    """Noise that is not less than that of any file; None where no file says it."""
+    """Noise that is at least that of any file; None where no file states it."""
     if not noises:
         return None
     return DepthNoise(*(max(values) for values in zip(*(astuple(n) for n in noises), strict=True)))
 
 
 def _unknown(count: int, size: tuple[int, ...]) -> WindowOutput:
-    """Return an answer that says nothing yet."""
+    """Return an output without any values."""
     return WindowOutput(
         np.full((count, 4, 4), np.nan),
         np.zeros((count, *size), np.float32),

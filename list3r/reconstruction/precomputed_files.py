@@ -1,4 +1,4 @@
-"""The `.npz` layout in which a model that runs elsewhere hands its geometry over (docs/precomputed.md).
+"""The `.npz` layout in which a model that runs elsewhere provides its geometry (docs/precomputed.md).
 
 A folder holds `precomputed.json` and `.npz` files, each of some frames in one gauge. Only numbers and booleans are
 read, nothing is unpickled, and a header that claims more than its bytes is refused.
@@ -25,7 +25,7 @@ MANIFEST = "precomputed.json"
 FORMAT = "list3r-precomputed"
 VERSION = 1
 _FREE_BYTES, _MOST_RATIO = 64 * 2**20, 200
-"""What an archive may claim: so much, and so many times its own size; depth and points shrink to a tenth at best."""
+"""Limits of an archive: its size, and the ratio to its packed size; depth and points shrink to a tenth at best."""
 MAX_BYTES = 8 * 2**30
 """No file unpacks to more: 1,000 frames of 1,000 x 1,000 pixels."""
 _MAX_MANIFEST = 2**20
@@ -35,7 +35,7 @@ _OPTIONAL = {"masks": "iu", "features": "f", "depth_noise": "f"}
 
 @dataclass(frozen=True)
 class Manifest:
-    """What holds for all files of a folder."""
+    """Facts of all files of a folder."""
 
     scale: str = "relative"
     """metric or relative."""
@@ -54,7 +54,7 @@ class Manifest:
 
 @dataclass(frozen=True)
 class Piece:
-    """What one file says of F frames, in one gauge."""
+    """The contents of one file: F frames, in one gauge."""
 
     frames: NDArray[np.int64]
     """Numbers of the frames in their source, ascending. Shape (F,)."""
@@ -67,15 +67,15 @@ class Piece:
     confidence: NDArray[np.float32]
     """In [0, 1]. Shape (F, h, w)."""
     masks: NDArray[np.int32] | None = None
-    """Thing at each pixel, 0 for none; the same number is the same thing throughout the file. Shape (F, h, w)."""
+    """Instance at each pixel, 0 for none; the same number is the same instance throughout the file. Shape (F, h, w)."""
     features: NDArray[np.float32] | None = None
-    """Object feature of thing n in row n - 1. Shape (N, D)."""
+    """Feature of instance n in row n - 1. Shape (N, D)."""
     depth_noise: NDArray[np.float64] | None = None
     """`base`, `quadratic` and `half_share` of a `DepthNoise`, in the file's units. Shape (3,)."""
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a folder. Raises `OptionError` for a folder that has none, or one that makes no sense."""
+    """Return the manifest of a folder. Raises `OptionError` for a folder that has none, or an invalid one."""
     path = folder / MANIFEST
     if not path.is_file():
         raise OptionError(f"{folder} has no {MANIFEST}; see docs/precomputed.md, or write it with `list3r precompute`")
@@ -126,7 +126,7 @@ def read_frames(path: Path) -> NDArray[np.int64]:
 
 
 def read_piece(path: Path) -> Piece:
-    """One file. Raises `OptionError`, naming the array that is wrong."""
+    """Return one file. Raises `OptionError` that names the invalid array."""
     found = read_arrays(path, (*_NEEDED, *_OPTIONAL))
     missing = sorted(_NEEDED.keys() - found.keys())
     if missing:
@@ -168,7 +168,7 @@ def _checked_frames(frames: NDArray[Any], path: Path) -> NDArray[np.int64]:
 
 
 def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Return the named arrays of an archive. Raises `OptionError` when it is damaged, or claims what is not there."""
+    """Return the named arrays of an archive. Raises `OptionError` when it is damaged, or its header is wrong."""
     try:
         check_ordinary(path.stat(), path, MAX_BYTES)
         with open_archive(path) as archive:

@@ -15,18 +15,18 @@ __all__ = ["MODELS", "ModelOptions", "make_reconstructor"]
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """What every reconstruction model is given."""
+    """The inputs of every reconstruction model."""
 
     poses: str = "estimate"
     """given, prior or estimate."""
     camera_known: bool = True
-    """False where the camera handed over is only a guess, which the model may better."""
+    """False where the given camera is only a guess, which the model may improve."""
     device: str = "auto"
     """cpu, cuda, cuda:1, ... or auto: the first GPU where there is one."""
     weights: str | None = None
     """A folder, a file or `repository@revision` of weights instead of the model's own; None for its own."""
     local_features: str = "sift"
-    """Local features by which `sfm` ties pictures between which nothing can be followed: sift or aliked."""
+    """Local features by which `sfm` matches pictures that tracks do not connect: sift or aliked."""
     feature_weights: str | None = None
     """File of the weights of learned local features."""
     settings: ReconstructionSettings = field(default_factory=ReconstructionSettings)
@@ -35,7 +35,7 @@ class ModelOptions:
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """Where a model lives and what it needs."""
+    """Module and needs of a model."""
 
     module: str
     """Module under `list3r.reconstruction`, which has `make(options: ModelOptions) -> Reconstructor`."""
@@ -46,17 +46,17 @@ class ModelEntry:
     calibration: str = ""
     """Module that estimates an unknown camera before the chunks, by `calibrate(source, settings)`."""
     thins: bool = False
-    """Can do with depth of some of the frames where all show the same from nearly the same place."""
+    """Needs depth of only some of the frames where all show the same from nearly the same place."""
     skips: bool = False
-    """Need not look at frames between those that get depth, and has `thinned(frames, camera, deep)`."""
+    """Can skip frames between those that get depth, and has `thinned(frames, camera, deep)`."""
     maps_videos: bool = False
     """Has `placed(frames, camera, T_map_cam)` for chunks of a video that was mapped as a whole before."""
     by_cameras: bool = False
     """Knows its cameras better than its surfaces: chunks are joined by both, loops refined by features."""
     follows_prior: bool = False
-    """Starts from poses that are given but imperfect, and betters them."""
+    """Starts from given but imperfect poses, and improves them."""
     reads_files: bool = False
-    """Reads geometry from a folder, which takes the place of weights and says how it was cut."""
+    """Reads geometry from a folder that is given as weights, with its chunk length and overlap."""
 
 
 MODELS: dict[str, ModelEntry] = {

@@ -1,4 +1,4 @@
-"""Settings of every reconstruction, and of what a chunk keeps of its frames."""
+"""Settings of every reconstruction, and of the stored parts of a chunk's frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from list3r.reconstruction.sfm.settings import SfmSettings
 
 @dataclass(frozen=True)
 class KeyframeSettings:
-    """What is kept of a keyframe."""
+    """The stored parts of a keyframe."""
 
     depth_width: int = 160
     """Width of the small depth image, px."""
@@ -34,9 +34,9 @@ class KeyframeSettings:
 class SampleSettings:
     """Which points of its frames a chunk keeps for alignment.
 
-    Three nested grids, fixed in the picture, so that two chunks that share a frame share pixels whatever each found in
-    it: every fourth column and row of the finest in frames of the interior, every second in frames near the ends,
-    which neighbouring chunks share, and one grid finer on small things.
+    Three nested grids, fixed in the picture, so that two chunks that share a frame share pixels whatever each detected:
+    every fourth column and row of the finest in frames of the interior, every second in frames near the ends, which
+    neighbouring chunks share, and one grid finer on small instances.
     """
 
     columns: int = 64
@@ -46,14 +46,14 @@ class SampleSettings:
     end_frames: int = 30
     """Frames at either end of the chunk that count as near it: the usual overlap."""
     small_share: float = 0.02
-    """Share of the picture up to which a mask counts as a small thing's."""
+    """Share of the picture up to which a mask counts as small."""
     resolution_bits: int = 15
     """Points are rounded to 2^-bits of their extent (0.2 mm in 6 m), so that they compress."""
 
 
 @dataclass(frozen=True)
 class ReconstructionSettings:
-    """Settings of all reconstruction models, of which one runs, and of what every chunk keeps."""
+    """Settings of all reconstruction models, of which one runs, and of the stored parts of every chunk."""
 
     rgbd: RgbdSettings = field(default_factory=RgbdSettings)
     sfm: SfmSettings = field(default_factory=SfmSettings)

@@ -1,4 +1,4 @@
-"""Sparse Cholesky factors of block matrices: solutions, and the blocks of the inverse that lie on the pattern.
+"""Sparse Cholesky factors of block matrices: solutions, and the blocks of the inverse on the pattern.
 
 Multifrontal (Duff and Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", 1983) on the
 graph of blocks, so that all arithmetic is dense BLAS on fronts of some hundred rows. The inverse follows Takahashi,
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _SMALL_FRONT = 7
-"""Fronts of up to so many blocks are joined to their parent whatever zeros that adds: calls cost more than sums. A
-factor of larger ones takes more room, at no gain of time."""
+"""Fronts of up to this many blocks are merged with their parent however many zeros that adds: a call costs more than
+the sums. Merging larger ones takes memory and gains no time."""
 _ZEROS = 0.2
 """Share of zeros that joining two larger fronts may add."""
 
@@ -33,27 +33,27 @@ class NotPositiveError(ArithmeticError):
 
 @dataclass(frozen=True)
 class Front:
-    """One dense step of the elimination."""
+    """One dense elimination step."""
 
     pivots: Rows
     """Blocks that are eliminated here, in order of elimination. Shape (P,)."""
     below: Rows
-    """Later blocks that they touch. Shape (B,)."""
+    """Later blocks that share an entry with the pivots. Shape (B,)."""
     parent: int
-    """Number of the front that takes what is left, -1 for a root."""
+    """Number of the front that receives the Schur complement, -1 for a root."""
     into: Rows
     """Scalar rows of `below` within the parent's front. Shape (B * D,)."""
     entries: Rows
-    """Which off-diagonal blocks of the matrix enter here. Shape (N,)."""
+    """Numbers of the matrix's off-diagonal blocks that enter here. Shape (N,)."""
     at: tuple[Rows, Rows]
-    """Block row and column of those within this front, row > column."""
+    """Block row and column of these entries within this front, row > column."""
     repeated: bool
-    """True where two of them are at one place."""
+    """True where two entries have the same row and column."""
 
 
 @dataclass(frozen=True)
 class BlockPattern:
-    """Where a symmetric matrix of n x n blocks is not zero, and the order in which it is eliminated."""
+    """The nonzero blocks of a symmetric matrix of n x n blocks, and its elimination order."""
 
     count: int
     size: int
@@ -70,7 +70,7 @@ class BlockPattern:
 
 
 def _structure(count: int, rows: Rows, columns: Rows) -> tuple[Rows, list[Rows]]:
-    """Place of each block in the elimination, and by place the later places that it touches once it is filled in."""
+    """Return each block's position in the elimination, and by position the later nonzero rows after fill-in."""
     ones = np.full(len(rows), -1.0)
     degree = np.bincount(rows, minlength=count) + np.bincount(columns, minlength=count) + 1.0
     i = np.concatenate([rows, columns, np.arange(count)])
@@ -87,8 +87,8 @@ def _structure(count: int, rows: Rows, columns: Rows) -> tuple[Rows, list[Rows]]
 
 
 def _postorder(structure: list[Rows]) -> Rows:
-    """Return the new places that fill in no more, at which every block comes right after those that lead up to it (the
-    postorder of the elimination tree), so that blocks of like structure lie side by side. Shape (n,)."""
+    """Return the postorder of the elimination tree: no additional fill-in, and blocks of similar structure are
+    adjacent. Shape (n,)."""
     count = len(structure)
     children: list[list[int]] = [[] for _ in range(count + 1)]
     for k in sorted(range(count), key=lambda k: len(structure[k]), reverse=True):
@@ -104,7 +104,7 @@ def _postorder(structure: list[Rows]) -> Rows:
 
 
 def _groups(structure: list[Rows]) -> list[tuple[int, int]]:
-    """Return runs of places that are eliminated together: [start, end) with almost the same structure."""
+    """Return runs of positions that are eliminated together: [start, end) with almost the same structure."""
     groups: list[tuple[int, int, int]] = []
     for k, own in enumerate(structure):
         start, filled = k, 1 + len(own)
@@ -130,7 +130,7 @@ def _pattern(count: int, size: int, place: Rows, structure: list[Rows], rows: Ro
     later, sooner = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
     order = np.argsort(front_at[sooner], kind="stable")
     bounds = np.searchsorted(front_at[sooner][order], np.arange(len(groups) + 1))
-    # A front's structure is that of all its places: joined fronts bring their children's rows along.
+    # A front's structure is that of all its positions: merged fronts include their children's rows.
     below = [_below(structure, a, b) for a, b in groups]
     held = [np.concatenate([np.arange(a, b), rest]) for (a, b), rest in zip(groups, below, strict=True)]
     fronts = []

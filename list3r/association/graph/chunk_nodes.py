@@ -1,8 +1,8 @@
-"""Nodes along a chunk, and what two chunks say of the frames that both hold, node by node.
+"""Nodes along a chunk, and the relation of two chunks at each of their shared frames.
 
-A reconstruction bends slowly, which one similarity per chunk cannot undo; so a chunk is cut into runs of a few frames,
-each with a similarity of its own (a node). Two chunks that share frames give, for each of those frames, how the one
-reconstruction of it lies to the other: its camera in both chunks, and the ratio of its depths.
+A reconstruction deforms slowly, which one similarity per chunk cannot correct; so a chunk is cut into runs of a few
+frames, each with its own similarity (a node). Each shared frame relates the two chunks: its camera pose in both, and
+the ratio of its depths.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from list3r.association.graph.edge_information import about
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples
-from list3r.reconstruction.turns import lost_scale
+from list3r.reconstruction.scale_loss import lost_scale
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _LEAST_POINTS = 20
-"""Points of a frame that both chunks hold, before the ratio of its depths says something."""
+"""Shared points of a frame from which the ratio of its depths counts."""
 _LEAST_FRAMES = 6
-"""Shared frames of an edge before their relations show how chunks bend."""
+"""Shared frames of an edge from which their relations show how chunks deform."""
 
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """How chunks may bend."""
+    """How chunks may deform."""
 
     enabled: bool = True
     """False: every chunk is rigid."""
     frames: int = 10
-    """Frames of a node: long enough to average what single frames err by, short against the 30 of an overlap."""
+    """Frames of a node: enough to average the errors of single frames, few against the 30 of an overlap."""
     measured_share: float = 0.3
-    """Share of the measured change of relation along overlaps that is taken as a random walk of the chunks: errors
-    of single frames are in it, and bending grows slower than a walk does. Chosen among 0.03 to 3, see
+    """Share of the measured change of relation along overlaps that is modelled as a random walk of the chunks: the
+    change includes errors of single frames, and deformation grows slower than a walk. Chosen among 0.03 to 3, see
     research/association 0043."""
     shift_walk: float = 1e-4
-    """Deviation of the shift that a frame adds beyond what overlaps show, as a share of the depth: chunks of the same
-    depth images err alike, and do not see it."""
+    """Standard deviation of the shift that a frame adds and overlaps do not show, as a share of the depth: chunks from
+    the same depth images share this error."""
     turn_walk: float = 6e-4
-    """The same of the turn, radians: `WeightSettings.bend` in a chunk of 100 frames."""
+    """The same of the rotation, radians: `WeightSettings.bending` in a chunk of 100 frames."""
     least_walk: float = 1e-5
-    """Least deviation per frame, of everything."""
+    """Least standard deviation per frame, of all components."""
     common: float = 1e-3
-    """Deviation that all frames of a node share, as a share of the depth, in radians, of the logarithm of scale."""
+    """Standard deviation that all frames of a node share, as a share of the depth, in radians, of the log scale."""
 
 
 @dataclass(frozen=True)
@@ -58,18 +58,18 @@ class ChunkNodes:
     node: Ints
     """Node of each posed frame. Shape (G,)."""
     frames: Ints
-    """Frame.index of those. Shape (G,)."""
+    """Frame.index of each posed frame. Shape (G,)."""
     at: Array
     """Mean Frame.index of each node. Shape (N,)."""
     center: Array
-    """Middle of what each node's frames see, chunk coordinates. Shape (N, 3)."""
+    """Centre of the points that each node's frames see, chunk coordinates. Shape (N, 3)."""
     reach: Array
-    """How far that is from the camera. Shape (N,)."""
+    """Distance of that centre from the camera. Shape (N,)."""
     count: Ints
     """Frames of each node. Shape (N,)."""
     turns: Array
-    """Covariance of a node's similarity as the next one sees it, by scale that is lost where the camera turns, if
-    structure from motion followed it. Shape (N - 1, 7, 7)."""
+    """Covariance of a node's similarity relative to the next one, from scale lost while the camera rotates (structure
+    from motion). Shape (N - 1, 7, 7)."""
 
     @staticmethod
     def of(samples: FrameSamples, length: int) -> ChunkNodes:
@@ -98,7 +98,7 @@ class ChunkNodes:
         return int(self.node[len(self.node) // 2])
 
     def turned(self, a: int, b: int) -> Array:
-        """Return the covariance of one node's similarity as another one sees it, by turns between. Shape (7, 7)."""
+        """Return the covariance of one node's similarity relative to another, from rotations between. Shape (7, 7)."""
         return np.asarray(self.turns[min(a, b) : max(a, b)].sum(axis=0))
 
     def nearest(self, frame: int) -> int:
@@ -108,22 +108,22 @@ class ChunkNodes:
 
 @dataclass(frozen=True)
 class FrameRelations:
-    """How the two reconstructions of F shared frames lie to each other."""
+    """Relation of the two reconstructions at F shared frames."""
 
     frames: Ints
     """Frame.index. Shape (F,)."""
     off: Array
-    """x in S_v_u(frame) = S_v_u exp(x), S_v_u that of the edge, about the middle of what the frame sees in u, shifts as
-    shares of how far that is. Shape (F, 7)."""
+    """x in S_v_u(frame) = S_v_u exp(x), S_v_u that of the edge, about the centre of the points that the frame sees in
+    u; shifts as shares of the distance of that centre. Shape (F, 7)."""
 
     def rigid(self) -> FrameRelations:
-        """Return what they say of chunks whose scale is known: the shift of that middle, and the turn about it."""
+        """Return the relations for chunks of known scale: shift of the centre, and rotation about it."""
         return replace(self, off=self.off * ([1.0] * 6 + [0.0]))
 
 
 @dataclass(frozen=True)
 class Tie:
-    """What the frames of one node of u and one of v say of their relation."""
+    """Mean relation of a node of u and a node of v over their shared frames."""
 
     u: int
     v: int
@@ -133,7 +133,7 @@ class Tie:
 
 
 def relate_frames(u: FrameSamples, v: FrameSamples, edge: Edge, nodes_u: ChunkNodes) -> FrameRelations:
-    """Return the relation of every frame that both chunks hold with enough depth."""
+    """Return the relation of every frame that has enough depth in both chunks."""
     at_u, at_v = shared_samples(u, v)
     frames, rows = [], []
     S_u_v = edge.S_v_u.inverse()
@@ -180,8 +180,8 @@ def ties_of(
 
 
 def measured_walk(relations: Sequence[FrameRelations]) -> Array:
-    """Return the variance of shift, turn and log scale that one frame adds in one chunk, by how relations change along
-    overlaps.
+    """Return the variance of shift, rotation and log scale that one frame adds in one chunk, from the change of
+    relations along overlaps.
 
     Shares of the depth, radians. Each overlap is cut into thirds; two chunks change independently. Shape (3,), 0 where
     no overlap is long enough.
@@ -199,7 +199,7 @@ def measured_walk(relations: Sequence[FrameRelations]) -> Array:
 
 
 def walk_covariance(nodes: ChunkNodes, first: int, walk: Array) -> Array:
-    """Return the covariance of a node's similarity as the next one sees it. Shape (7, 7)."""
+    """Return the covariance of a node's similarity relative to the next one. Shape (7, 7)."""
     pair = slice(first, first + 2)
     center, reach = nodes.center[pair].mean(axis=0), float(nodes.reach[pair].mean())
     back = about(center[None])[0]
@@ -208,7 +208,7 @@ def walk_covariance(nodes: ChunkNodes, first: int, walk: Array) -> Array:
 
 
 def _turns(T_chunk_cam: Array, reach: Array, node: Ints) -> Array:
-    """Return `ChunkNodes.turns`: what each step between the middles of two nodes adds, about its camera."""
+    """Return `ChunkNodes.turns`: the part of each step between two nodes' middle frames, about its camera."""
     starts = np.searchsorted(node, np.arange(int(node.max(initial=0)) + 2))
     if len(starts) < 3:
         return np.zeros((0, 7, 7))
@@ -223,7 +223,7 @@ def _depth(T_chunk_cam: Array, points: NDArray[np.float32]) -> Array:
 
 
 def _robust_mean(x: Array) -> tuple[Array, Array]:
-    """Return the mean of rows without those far off (Cauchy-like weights), and their robust deviation. Shapes (7,)."""
+    """Return the mean of rows without outliers (Cauchy-like weights), and their robust deviation. Shapes (7,)."""
     middle = np.median(x, axis=0)
     scatter = 1.4826 * np.median(np.abs(x - middle), axis=0)
     for _ in range(5):
@@ -234,7 +234,7 @@ def _robust_mean(x: Array) -> tuple[Array, Array]:
 
 
 def _views(samples: FrameSamples) -> tuple[Array, Array]:
-    """Return the middle of what each posed frame sees, and how far it is from the camera. Shapes (G, 3) and (G,)."""
+    """Return the centre of the points that each posed frame sees, and its distance. Shapes (G, 3) and (G,)."""
     order = np.argsort(samples.frame, kind="stable")
     points = samples.points[order].astype(np.float64)
     starts = np.searchsorted(samples.frame[order], samples.camera_frames, "left")

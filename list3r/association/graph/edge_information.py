@@ -1,4 +1,4 @@
-"""The information matrix of each edge of the graph, from its covariance and the bending of chunks.
+"""The information matrix of each edge of the graph, from its covariance and the deformation of chunks.
 
 The paper weighs edges by their confidence instead (A.4): `benchmarks/peers/graph_weights.py`, research/association
 0041.
@@ -24,23 +24,23 @@ class WeightSettings:
     """How edges are weighted."""
 
     lever_m: float = 1.0
-    """Distance at which a turn counts as much as a shift where an edge does not say, metres; without metric scale half
-    the spread of its points takes its place."""
-    bend: float = 0.006
-    """Deviation of a chunk's shape between the places where two edges hold it, as a share of the support's radius for
-    shifts, in radians for turns, and of the logarithm of scale: a prior that loops correct."""
-    own_bend: float = 0.013
-    """Deviation of a chunk's frame, as its edges see it, from its own cameras, in the same units as `bend`. It does not
-    weigh edges: it is part of what a chunk's covariance states, once for the chunk and once for the first chunk, which
-    everything is relative to. Chosen on four simulated videos (seed 101)."""
+    """Distance at which a rotation weighs as much as a shift where an edge has no lever, metres; without metric scale
+    half the spread of its points replaces it."""
+    bending: float = 0.006
+    """Standard deviation of a chunk's shape between the supports of two edges, as a share of the support's radius for
+    shifts, in radians for rotations, and of the log scale: a prior that loops correct."""
+    own_bending: float = 0.013
+    """Standard deviation of a chunk's frame, as its edges see it, from its own cameras, in the units of `bending`. It
+    does not weight edges: it is part of a chunk's stated covariance, once for the chunk and once for the first chunk
+    of the component. Chosen on four simulated videos (seed 101)."""
     least_confidence: float = 0.01
-    """Confidence, in [0, 1], that an edge without a covariance is taken to have at least."""
+    """Least confidence, in [0, 1], assumed for an edge without a covariance."""
     unmeasured: float = 0.02
-    """The same for the error of an edge without a covariance at confidence 1."""
+    """Standard deviation of an edge without a covariance at confidence 1, as for `bending`."""
 
 
 def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
-    """Return the inverse covariances of the edges' tangent errors with bending, in u's units.
+    """Return the inverse covariances of the edges' tangent errors with deformation, in u's units.
 
     Shape (E, D, D), D = 6 if metric else 7.
     """
@@ -48,7 +48,9 @@ def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings
     covariance = np.empty((len(edges), 7, 7))
     measured = np.array([e.covariance is not None for e in edges], bool)
     if measured.any():
-        covariance[measured] = _bent(np.array([e.covariance for e in edges if e.covariance is not None]), settings)
+        covariance[measured] = _with_bending(
+            np.array([e.covariance for e in edges if e.covariance is not None]), settings
+        )
     for k in np.flatnonzero(~measured).tolist():
         covariance[k] = _unmeasured(edges[k], metric, settings)
     inverse = np.linalg.inv(covariance[:, :size, :size])
@@ -56,7 +58,7 @@ def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings
 
 
 def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settings: WeightSettings) -> Array:
-    """Return covariances of chunks' frames from their own bending, about the middle of what their edges stand on, chunk
+    """Return covariances of chunks' frames from their own deformation, about the centre of their edges' support, chunk
     units.
 
     Shape (K, 7, 7), 0 for chunks without an edge that states a covariance.
@@ -65,17 +67,17 @@ def own_shapes(edges: Sequence[Edge], row: Mapping[int, int], count: int, settin
     out, seen = np.zeros((count, 7, 7)), np.zeros(count)
     if stated:
         covariance = np.array([e.covariance for e in stated])
-        shape = _bent(covariance, settings) - covariance
+        shape = _with_bending(covariance, settings) - covariance
         moved = adjoint(stack([e.S_v_u for e in stated]))
         rows = np.array([[row[e.u], row[e.v]] for e in stated])
         np.add.at(out, rows[:, 0], shape)
         np.add.at(out, rows[:, 1], moved @ shape @ np.swapaxes(moved, 1, 2))
         np.add.at(seen, rows, 1)
-    return np.asarray(out * (settings.own_bend / settings.bend) ** 2 / np.maximum(seen, 1)[:, None, None])
+    return np.asarray(out * (settings.own_bending / settings.bending) ** 2 / np.maximum(seen, 1)[:, None, None])
 
 
 def lever_of(edge: Edge, metric: bool, settings: WeightSettings) -> float | None:
-    """Return half the spread of an edge's points in u's units; None where it does not say."""
+    """Return half the spread of an edge's points in u's units; None where it is not stated."""
     if metric or "spread" not in edge.scores:
         return settings.lever_m if metric else None
     return max(0.5 * edge.scores["spread"] / float(edge.S_v_u.scale), 1e-9)
@@ -86,15 +88,15 @@ def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:
     lever = lever_of(edge, metric, settings) or settings.lever_m
     deviation = settings.unmeasured / np.sqrt(max(edge.confidence, settings.least_confidence))
     unit = np.array([lever] * 3 + [1.0] * 4)
-    return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bend**2)))
+    return np.asarray(np.diag(unit**2 * (deviation**2 + settings.bending**2)))
 
 
-def _bent(covariance: Array, settings: WeightSettings) -> Array:
-    """Return covariances with bending about the middle of each edge's support. Shape (E, 7, 7)."""
+def _with_bending(covariance: Array, settings: WeightSettings) -> Array:
+    """Return covariances with deformation about the centre of each edge's support. Shape (E, 7, 7)."""
     center, radius = support_of(covariance)
     shape = about(center)
     shape[:, :, :3] *= radius[:, None, None]
-    return np.asarray(covariance + settings.bend**2 * shape @ np.swapaxes(shape, 1, 2))
+    return np.asarray(covariance + settings.bending**2 * shape @ np.swapaxes(shape, 1, 2))
 
 
 def about(center: Array) -> Array:
@@ -105,7 +107,7 @@ def about(center: Array) -> Array:
 
 
 def support_of(covariance: Array) -> tuple[Array, Array]:
-    """Return centre and radius of the points that alignments with these covariances stood on. Shapes (E, 3) and (E,).
+    """Return centre and radius of the support of alignments with these covariances. Shapes (E, 3) and (E,).
 
     About the centre the errors of shift and turn are independent, which gives the centre; the ratio of their
     deviations is the radius. 0 and 1 where the turn has no error.

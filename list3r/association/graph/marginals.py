@@ -1,4 +1,4 @@
-"""How well each chunk is placed: marginal covariances, scaled by how well the edges kept their word."""
+"""The uncertainty of each chunk's pose: marginal covariances, scaled by the observed residuals of the edges."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Marginals:
     covariance: Array
     """Of each chunk's tangent error relative to the first of its component. Shape (K, D, D), 0 for that first one."""
     redundancy: Array
-    """Degrees of freedom that each edge has over what it determines, in [0, D]. Shape (E,)."""
+    """Degrees of freedom of each edge beyond those that it determines, in [0, D]. Shape (E,)."""
 
 
 def marginals(problem: GraphProblem, poses: Sim3, trust: Array) -> Marginals:
@@ -45,12 +45,11 @@ def marginals(problem: GraphProblem, poses: Sim3, trust: Array) -> Marginals:
 def variance_factors(
     squares: Array, redundancy: Array, trust: Array, kinds: NDArray[np.int64], before: Array, prior: float
 ) -> tuple[Array, Array]:
-    """Estimate how many times larger the errors of each kind of edge are (squared) than `before` says, and the freedom
-    behind.
+    """Estimate the variance of each kind of edge over that which `before` states, and its degrees of freedom.
 
     Helmert's estimation of variance components with `prior` degrees of freedom at 1. `squares`, `redundancy` and
-    `trust` have shape (E,), `kinds` numbers the kind of each edge, `before` has a factor for each kind. What edges
-    that are not trusted say does not count.
+    `trust` have shape (E,), `kinds` numbers the kind of each edge, `before` has a factor for each kind. Outlier edges
+    do not count.
     """
     factors, freedom = np.ones_like(before), np.full_like(before, prior)
     for kind in range(len(before)):

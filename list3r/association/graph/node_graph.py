@@ -1,10 +1,10 @@
-"""Bend chunks so that shared frames and loop closures agree: a graph of nodes within chunks (paper A.1 has anchors
-every 50 frames).
+"""Deform chunks so that shared frames and loop closures agree: a graph of nodes within chunks (in the paper's A.1 a
+node every 50 frames).
 
-The graph of chunks (`pose_graph`) decides which edges are believed. Here every chunk is cut into nodes (`chunk_nodes`);
-neighbouring nodes are tied as stiffly as the overlaps show that chunks are, nodes of two chunks by the frames that both
-hold, and loops hold the nodes of the frames that they were found at. The same solver places all nodes; their mean
-places the chunk, and what is left is the chunk's bend. What it gains: research/association 0043.
+The graph of chunks (`pose_graph`) decides which edges are inliers. Every chunk is cut into nodes (`chunk_nodes`): its
+neighbouring nodes are tied as stiffly as overlaps show, nodes of two chunks by their shared frames, and nodes of a
+loop's two frames by the loop. The same solver places all nodes; their mean places the chunk, and the remainder is the
+chunk's non-rigid correction. The gain: research/association 0043.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from list3r.memory.records import Edge
 
 Array = NDArray[np.float64]
 
-_NOTHING = 1e9
-"""Variance factor of edges that are not believed, so that what they alone join stays where it is."""
+_UNTRUSTED = 1e9
+"""Variance factor of outlier edges, so that components that only they join stay in place."""
 _STEPS = 10
-"""Most steps of the solution; it starts near."""
+"""Most steps of the solution; its start is near."""
 
 
 @dataclass(frozen=True)
 class NodeGraphParts:
-    """What the graph is made of."""
+    """The inputs of the node graph."""
 
     nodes: dict[int, ChunkNodes]
     """By chunk id."""
     relations: list[tuple[Edge, FrameRelations]]
-    """Of adjacent edges that are believed."""
+    """Of inlier adjacent edges."""
     chunks: SampledChunks
-    """Where it comes from."""
+    """The samples that nodes and relations come from."""
 
     @cached_property
     def first(self) -> dict[int, int]:
@@ -72,10 +72,10 @@ def bend_chunks(
     weights: GraphSettings | None = None,
     turning: Collection[int] = (),
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """Return the graph with every chunk where its nodes are on average, and the bend of each chunk.
+    """Return the graph with every chunk at the mean of its nodes, and the non-rigid correction of each chunk.
 
-    The first chunk of each component stays where it is. `rigid` chunks do not bend (their poses were given), `turning`
-    ones lose scale where their camera turns; chunks without posed frames have no bend.
+    The first chunk of each component stays in place. `rigid` chunks do not deform (their poses were given), `turning`
+    ones lose scale where their camera rotates; chunks without posed frames have no correction.
     """
     chosen = settings or NodeSettings()
     known = graph.S_graph_chunk
@@ -86,7 +86,7 @@ def bend_chunks(
     start = [graph.S_graph_chunk[c] for c, nodes in pieces.nodes.items() for _ in nodes.at]
     problem = _problem(pieces, believed, graph.components, metric, chosen, weights or GraphSettings(), turning)
     placed = problem.solve(stack(start), np.ones(len(problem.u)), _STEPS)
-    return _settled(placed, pieces.nodes, graph, rigid)
+    return _place_chunks(placed, pieces.nodes, graph, rigid)
 
 
 def pieces_of(
@@ -112,7 +112,7 @@ def _problem(
     weights: GraphSettings,
     turning: Collection[int],
 ) -> GraphProblem:
-    """Lay out all nodes and all that ties them."""
+    """Lay out all nodes and all ties between them."""
     first = pieces.first
     ends: list[tuple[int, int]] = []
     between: list[Sim3] = []
@@ -127,8 +127,8 @@ def _problem(
     walk = np.maximum(walk + np.array([settings.shift_walk, settings.turn_walk, 0.0]) ** 2, settings.least_walk**2)
     for chunk, nodes in pieces.nodes.items():
         for k in range(len(nodes.at) - 1):
-            bent = walk_covariance(nodes, k, walk) + (nodes.turns[k] if chunk in turning else 0.0)
-            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), bent)
+            deformation = walk_covariance(nodes, k, walk) + (nodes.turns[k] if chunk in turning else 0.0)
+            add(first[chunk] + k, first[chunk] + k + 1, Sim3.identity(), deformation)
     tied = set()
     for edge, relations in pieces.relations:
         relations = relations.rigid() if metric else relations
@@ -138,8 +138,8 @@ def _problem(
         if ties:
             tied.add((edge.u, edge.v))
     size = 6 if metric else 7
-    # Where scale is known it is not one more unknown: the block of the inverse, not the inverse of the block. Else what
-    # ratios of depths leave open would let a chunk slide towards its origin, however far that is.
+    # Where scale is known it is no unknown: the block of the inverse, not the inverse of the block. Otherwise the
+    # uncertainty of depth ratios would let a chunk slide towards its origin, however far away that is.
     information = inverses(np.array(covariances).reshape(-1, 7, 7))[:, :size, :size]
     rest = [e for e in believed if e.kind != "adjacent" or (e.u, e.v) not in tied]
     for edge in rest:
@@ -147,8 +147,8 @@ def _problem(
         add(first[edge.u] + tie.u, first[edge.v] + tie.v, tie.S_v_u, tie.covariance)
     if rest:
         factors = np.array([e.scores.get("variance_factor", 1.0) for e in rest])
-        factors[[not e.accepted for e in rest]] *= _NOTHING
-        stiff = replace(weights.weights, bend=0.0)  # the nodes bend instead
+        factors[[not e.accepted for e in rest]] *= _UNTRUSTED
+        stiff = replace(weights.weights, bending=0.0)  # the nodes deform instead
         information = np.concatenate([information, information_of(rest, metric, stiff) / factors[:, None, None]])
     fixed = np.zeros(pieces.count, bool)
     fixed[[first[c] for c in first if components[c] == c]] = True
@@ -157,22 +157,22 @@ def _problem(
 
 
 def _whole(edge: Edge, nodes: Mapping[int, ChunkNodes]) -> Tie:
-    """Return an edge that holds the nodes of the frames that it was found at; the ends that face each other where it
-    does not say (its information is that of the edge)."""
+    """Return an edge as a tie of the nodes of its two frames; of the ends that face each other where it has no frames
+    (its information is that of the edge)."""
     u, v = nodes[edge.u], nodes[edge.v]
     if edge.frames is not None:
         return Tie(u.nearest(edge.frames[0]), v.nearest(edge.frames[1]), edge.S_v_u, np.eye(7))
     return Tie(len(u.at) - 1, 0, edge.S_v_u, np.eye(7))
 
 
-def _settled(
+def _place_chunks(
     placed: Sim3,
     nodes: Mapping[int, ChunkNodes],
     graph: GraphResult,
     rigid: Collection[int],
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """Place the chunks at the mean of their nodes, moved so that the first chunk of each component stays, and their
-    bends."""
+    """Place the chunks at the mean of their nodes, moved so that the first chunk of each component stays, and return
+    their non-rigid corrections."""
     chunks = list(nodes)
     sizes = [len(nodes[c].at) for c in chunks]
     owner, weight = np.repeat(np.arange(len(chunks)), sizes), np.concatenate([nodes[c].count for c in chunks])

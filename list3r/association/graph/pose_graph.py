@@ -1,7 +1,7 @@
-"""The graph of chunks: all edges together decide where every chunk lies (paper A.4).
+"""The graph of chunks: all edges together determine the pose of every chunk (paper A.4).
 
-Minimises the sum of e^T W e, e = log(S_v_u^-1 S_v_world S_world_u), by Levenberg-Marquardt (`graph_solver`), W from
-the covariance of each edge and the bending of chunks (`edge_information`); false loops are switched off (`loop_trust`),
+Minimises the sum of e^T W e, e = log(S_v_u^-1 S_v_world S_world_u), by Levenberg-Marquardt (`solver`), W from the
+covariance of each edge and the deformation of chunks (`edge_information`); false loops are switched off (`edge_trust`),
 and every chunk gets a covariance (`marginals`). The start is always the chain of adjacent edges from each component's
 first chunk, so the result does not depend on the order in which chunks arrived.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.association.graph.edge_information import WeightSettings, information_of, own_shapes
-from list3r.association.graph.loop_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
+from list3r.association.graph.edge_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
 from list3r.association.graph.marginals import widening
 from list3r.association.graph.solver import GraphProblem, adjoint, unstack
 from list3r.memory.errors import DegenerateError
@@ -27,7 +27,7 @@ from list3r.memory.records import Edge
 Array = NDArray[np.float64]
 
 _ALONE = " (geometry alone: "
-"""What stands between why the graph does not believe an edge and what was said of it before."""
+"""Between the graph's reason to reject an edge and the edge's earlier reason."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class GraphSettings:
     least_weight: float = 1e-5
     """Loops of less information than this share of the strongest edge's are dropped (deviations 300 times larger)."""
     fits_quantile: float = 0.95
-    """A new chunk fits where all its edges' errors lie inside this quantile of what they state; otherwise its
+    """A new chunk fits where all its edges' errors are inside this quantile of their stated ones; otherwise its
     neighbourhood moves."""
     most_moved: int = 150
-    """Chunks near a new loop that move before the end of the session, where the way that it closes is no longer."""
+    """Chunks near a new loop that move before the end of the session, when the closed loop is longer than this."""
 
 
 @dataclass(frozen=True)
 class GraphResult:
-    """Where the chunks are."""
+    """The poses of the chunks."""
 
     S_graph_chunk: Mapping[int, Sim3]
     """By chunk id; chunks of different components share no frame."""
@@ -58,7 +58,7 @@ class GraphResult:
     edges: tuple[Edge, ...]
     """The edges as given, with `weight`, and loop edges that the rest contradicts no longer `accepted`."""
     residual: float
-    """RMS of the trusted edges' errors in their own standard deviations, 1 where they keep what they state."""
+    """RMS of the inlier edges' errors in their own standard deviations, 1 where errors are as stated."""
     covariances: Mapping[int, Array]
     """By chunk id, of x in S_true = S_graph_chunk exp(x), x = (rho, omega, sigma), relative to the first chunk of the
     component, which has 0. Shape (7, 7) each."""
@@ -74,7 +74,7 @@ def optimize(
     """Place all chunks. The first chunk of each component stays at `initial`, or at the origin if it is not in it.
 
     Edges that geometry did not accept are passed through; those that an earlier call rejected are tried again. Raises
-    `DegenerateError` for an edge that holds a number that is not finite.
+    `DegenerateError` for an edge with a number that is not finite.
     """
     chosen = settings or GraphSettings()
     ids = sorted(chunk_ids)
@@ -90,7 +90,7 @@ def optimize(
     weights = np.delete(weights, weak, axis=0)
     for n in reversed(weak):
         scores = {**active[n].scores, "trust": 0.0}
-        reason = f"too uncertain beside the other edges{_ALONE}{active[n].reason})"
+        reason = f"too uncertain compared with the other edges{_ALONE}{active[n].reason})"
         reason = active[n].reason if "trust" in active[n].scores and not active[n].accepted else reason
         out[used[n]] = replace(active[n], weight=0.0, accepted=False, scores=scores, reason=reason)
         del used[n], active[n]
@@ -121,7 +121,7 @@ def problem_of(
 
 
 def check(edges: Sequence[Edge]) -> None:
-    """Raise `DegenerateError` for an edge that holds a number that is not finite, by its name."""
+    """Raise `DegenerateError` that names an edge with a number that is not finite."""
     if not edges:
         return
     S = stack([e.S_v_u for e in edges])
@@ -137,8 +137,8 @@ def check(edges: Sequence[Edge]) -> None:
 
 
 def _covariances(found: TrustedGraph, own: Array, first: NDArray[np.int64]) -> Array:
-    """Return the covariance stated of each chunk: its place in the graph, its own bending, and that of the first chunk,
-    `first` (K,), which moves all others. Shape (K, 7, 7)."""
+    """Return the stated covariance of each chunk: its pose in the graph, its own deformation, and that of the first
+    chunk, `first` (K,), which moves all others. Shape (K, 7, 7)."""
     size = found.marginals.covariance.shape[1]
     own = own * found.factors[0]
     from_first = adjoint(found.poses.inverse() @ take(found.poses, first))
@@ -150,13 +150,13 @@ def _covariances(found: TrustedGraph, own: Array, first: NDArray[np.int64]) -> A
 
 
 def _strengths(information: Array) -> Array:
-    """Return information of each edge on turn (which has no unit), by geometric mean, the strongest 1. Shape (E,)."""
+    """Return each edge's information on rotation (which has no unit), geometric mean, the strongest 1. Shape (E,)."""
     size = np.cbrt(np.maximum(np.linalg.det(information[:, 3:6, 3:6]), 0.0))
     return np.asarray(size / max(float(size.max()), 1e-300))
 
 
 def _weak(edges: Sequence[Edge], ids: Sequence[int], weights: Array, settings: GraphSettings) -> list[int]:
-    """Return numbers of the loops that say next to nothing; none where the graph would fall apart without them."""
+    """Return numbers of the loops of negligible information; none where the graph would fall apart without them."""
     if not any(e.kind != "adjacent" for e in edges):
         return []
     strength = _strengths(weights)
@@ -203,7 +203,7 @@ class _SpanningTree:
         return Tree(self._parent, self._by, np.array(self._order, np.int64))
 
     def _along_adjacent(self, start: int) -> list[int]:
-        """Place what adjacent edges reach from a chunk. Returns the other edges met on the way."""
+        """Place the chunks that adjacent edges reach from a chunk. Returns the other edges met on the way."""
         queue, others = deque([start]), []
         while queue:
             chunk = queue.popleft()
@@ -258,7 +258,7 @@ def _neighbours(edges: Sequence[Edge]) -> dict[int, list[tuple[int, int]]]:
 
 
 def _judged(edge: Edge, strength: float, square: float, found: TrustedGraph, n: int) -> Edge:
-    """Return the edge with its weight in the graph, and what the graph thinks of it."""
+    """Return the edge with its weight in the graph, and whether it is an inlier."""
     deviations = deviations_of(square)
     trusted = bool(found.trust[n] > 0.5)
     trust = float((found.limit[n] / (square + found.limit[n])) ** 2)
@@ -278,5 +278,5 @@ def deviations_of(square: float) -> float:
 
 
 def contradicted(edge: Edge, deviations: float) -> str:
-    """Return why a loop is not believed."""
+    """Return why a loop is rejected."""
     return f"the rest of the graph contradicts it by {deviations:.1f} deviations{_ALONE}{edge.reason})"

@@ -1,5 +1,4 @@
-"""What the samples of chunks alone tell of how they bend, each piece once: their nodes, and the relations of the frames
-that two chunks hold."""
+"""The nodes of chunks, and the relations of the frames that two chunks share, each computed from the samples once."""
 
 from __future__ import annotations
 
@@ -22,40 +21,40 @@ from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
 
 _KEPT_BYTES = 12 << 20
-"""Of nodes, and of relations; each takes some 3 kB of a chunk. More are found again when they are asked for."""
+"""Of nodes, and of relations; each takes some 3 kB of a chunk. The least recently used are computed again."""
 
 
 class _Nodes(LruCache[Hashable, ChunkNodes]):
-    """By chunk, checksum of what it measured, and frames of a node."""
+    """By chunk, checksum of its samples, and frames of a node."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, _bytes_of)
 
 
 class _Relations(LruCache[Hashable, FrameRelations]):
-    """By the edge, checksums of what its chunks measured, and frames of a node."""
+    """By edge, checksums of its chunks' samples, and frames of a node."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, _bytes_of)
 
 
 class _Ties(LruCache[Hashable, tuple[Tie, ...]]):
-    """By the edge, checksums of what its chunks measured, their nodes, what the frames say, and settings."""
+    """By edge, checksums of its chunks' samples, their nodes, the frames' relations, and settings."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, lambda ties: 200 + 1000 * len(ties))
 
 
 class _Samples(LruCache[Hashable, FrameSamples]):
-    """Of the two chunks that were asked for last."""
+    """Of the last two chunks that were read."""
 
     def __init__(self) -> None:
         super().__init__(2)
 
 
 class SampledChunks:
-    """The samples of chunks. Of two at a time they are held; with a store what follows from them is kept as long as it
-    is open, so that the end of a session need not read them all again."""
+    """The samples of chunks. Those of two chunks are kept in memory; with a store their nodes, relations and ties are
+    kept while it is open, so that the end of a session need not read all samples again."""
 
     def __init__(self, read: Callable[[int], FrameSamples], store: Store | None = None) -> None:
         self._read, self._store = read, store
@@ -66,7 +65,7 @@ class SampledChunks:
 
     @staticmethod
     def of(store: Store) -> SampledChunks:
-        """Return those of a memory."""
+        """Return the samples of a memory."""
         return SampledChunks(store.chunks.samples, store)
 
     def nodes(self, chunk: int, length: int) -> ChunkNodes:
@@ -79,7 +78,7 @@ class SampledChunks:
         return self._nodes.put(key, found)
 
     def relations(self, edge: Edge, length: int) -> FrameRelations:
-        """Return the relation of every frame that both chunks of an edge hold; `length` is that of the nodes of u."""
+        """Return the relation of every frame that both chunks of an edge share; `length` is that of the nodes of u."""
         key = edge.u, edge.v, self._stamp(edge.u), self._stamp(edge.v), edge.S_v_u.as_matrix().tobytes(), length
         found = self._relations.get(key)
         if found is None:
@@ -90,7 +89,7 @@ class SampledChunks:
     def ties(
         self, edge: Edge, relations: FrameRelations, nodes: tuple[ChunkNodes, ChunkNodes], settings: NodeSettings
     ) -> tuple[Tie, ...]:
-        """Return the relations of an edge averaged over the frames of each of the nodes of its chunks."""
+        """Return the relations of an edge averaged over the frames of each of its chunks' nodes."""
         key = (
             (edge.u, edge.v, self._stamp(edge.u), self._stamp(edge.v), edge.S_v_u.as_matrix().tobytes()),
             (*(len(n.at) for n in nodes), bool(relations.off[:, 6].any()), settings),
@@ -99,8 +98,8 @@ class SampledChunks:
         return found if found is not None else self._ties.put(key, tuple(ties_of(relations, edge, *nodes, settings)))
 
     def turned(self, edge: Edge, turning: Collection[int], length: int) -> Edge:
-        """Return an edge as the middles of its chunks see it: with the scale that `turning` ones lose between there and
-        the frames that the edge stands on."""
+        """Return an edge relative to the middle nodes of its chunks: with the scale that `turning` chunks lose between
+        there and the frames that support the edge."""
         if edge.covariance is None or not (edge.u in turning or edge.v in turning):
             return edge
         u, v = self.nodes(edge.u, length), self.nodes(edge.v, length)
@@ -133,7 +132,7 @@ class SampledChunks:
 
 
 def _one_node() -> ChunkNodes:
-    """Return a chunk that shows nothing."""
+    """Return the node of a chunk without posed frames."""
     zero, none = np.zeros(1), np.zeros(1, np.int64)
     return ChunkNodes(none, none, zero, np.zeros((1, 3)), np.ones(1), np.ones(1, np.int64), np.zeros((0, 7, 7)))
 

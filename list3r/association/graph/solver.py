@@ -14,9 +14,9 @@ from list3r.memory.geometry import Sim3, skew, take
 Array = NDArray[np.float64]
 
 _CONVERGED = 1e-12
-"""Relative gain of a step at which the cost has settled."""
+"""Relative gain of a step at which the cost has converged."""
 _TOGETHER = 256
-"""Edges whose derivatives are held at once."""
+"""Edges whose derivatives are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class GraphProblem:
         e = self.residuals(poses)
         return np.asarray(np.einsum("ei,eij,ej->e", e, self.information, e, optimize=True))
 
-    def solve(self, poses: Sim3, trust: Array, iterations: int, settled: float = _CONVERGED) -> Sim3:
+    def solve(self, poses: Sim3, trust: Array, iterations: int, tolerance: float = _CONVERGED) -> Sim3:
         """Return the poses that minimise the sum of trust e^T W e, by damped Gauss-Newton from `poses`, until a step
-        gains less than a share `settled` of the cost. Shape of trust (E,)."""
+        gains less than a share `tolerance` of the cost. Shape of trust (E,)."""
         if len(self.u) == 0 or not (~self.fixed).any():
             return poses
         damping = 0.0
@@ -92,7 +92,7 @@ class GraphProblem:
                 continue
             gain, poses, cost, e, system = cost - new_cost, tried, new_cost, new, None
             damping = 0.0 if damping <= 1e-6 else damping / 10.0
-            if gain <= settled * cost + 1e-18:
+            if gain <= tolerance * cost + 1e-18:
                 break
         return poses
 

@@ -1,8 +1,8 @@
 """Place chunks of structure from motion a second time, for their instances: by depth instead of camera paths.
 
-A path of a few decimetres tells the scale of a chunk worse than its depth does (research/association 0044). Neighbours
-are tied by the cameras' directions and the ratio of the depths of shared frames, loops as they are. The cameras stay
-where their graph has them; the difference is part of each chunk's bend.
+A path of a few decimetres determines the scale of a chunk less well than its depth does (research/association 0044).
+Neighbours are tied by the cameras' directions and the depth ratios of shared frames, loops as they are. The cameras
+keep the poses of their own graph; the difference is part of each chunk's non-rigid correction.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _STEPS = 30
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """How far a chunk's depth bends between the places where two edges hold it."""
+    """How far a chunk's depth deforms between the supports of two edges."""
 
     shift: float = 0.01
-    """Deviation, as a share of how far it sees,"""
+    """Standard deviation, as a share of the viewing distance,"""
     turn_rad: float = 0.006
     """of directions,"""
     scale: float = 0.02
     """and of the logarithm of scale."""
     loop_scale: float = 0.015
-    """Error of the logarithm of a loop's scale, which depths tell; its edge reckons with more for the cameras' sake."""
+    """Error of the log scale of a loop by depth; its edge states more, for the cameras."""
 
 
 def place_by_surfaces(
@@ -48,10 +48,9 @@ def place_by_surfaces(
     bends: Mapping[int, Bend],
     settings: SurfaceSettings | None = None,
 ) -> tuple[GraphResult, dict[int, Bend]]:
-    """Return graph with its chunks where surfaces have them, and bends that leave the cameras where they are beside it.
+    """Return the graph with its chunks placed by surfaces, and corrections that keep the cameras in place.
 
-    The first chunk of each component stays; the cameras of a component move together, by the mean of what its chunks
-    move by.
+    The first chunk of each component stays; the cameras of a component move together, by the mean motion of its chunks.
     """
     s = settings or SurfaceSettings()
     known = graph.S_graph_chunk
@@ -80,18 +79,18 @@ def place_by_surfaces(
         np.array([graph.components[chunk] == chunk for chunk in ids]),
     )
     placed = unstack(problem.solve(stack([known[k] for k in ids]), np.ones(len(ties)), _STEPS), ids)
-    return replace(graph, S_graph_chunk=placed), _beside(placed, graph, bends)
+    return replace(graph, S_graph_chunk=placed), _camera_corrections(placed, graph, bends)
 
 
 def _bending(nodes: ChunkNodes, s: SurfaceSettings) -> Array:
-    """Return the covariance of a chunk's bending about the middle of what it sees. Shape (7, 7)."""
+    """Return the covariance of a chunk's deformation about the centre of its points. Shape (7, 7)."""
     back = about(nodes.center[:1])[0]
     deviation = np.repeat([s.shift * float(nodes.reach[0]), s.turn_rad, s.scale], [3, 3, 1])
     return np.asarray(back @ np.diag(deviation**2) @ back.T)
 
 
 def _sharper(edge: Edge, s: SurfaceSettings) -> Array:
-    """Return the covariance of an edge, of a loop with what depths tell of the scale. Shape (7, 7)."""
+    """Return the covariance of an edge, for a loop with the scale error of depth. Shape (7, 7)."""
     assert edge.covariance is not None
     factor = np.ones(7)
     if edge.kind == "loop":
@@ -99,8 +98,8 @@ def _sharper(edge: Edge, s: SurfaceSettings) -> Array:
     return np.asarray(edge.covariance * np.outer(factor, factor))
 
 
-def _beside(placed: Mapping[int, Sim3], graph: GraphResult, bends: Mapping[int, Bend]) -> dict[int, Bend]:
-    """Return bends that take what frames saw to where the cameras' graph has it, moved as the things are on average."""
+def _camera_corrections(placed: Mapping[int, Sim3], graph: GraphResult, bends: Mapping[int, Bend]) -> dict[int, Bend]:
+    """Return corrections that take each frame to its pose in the cameras' graph, after the chunks' mean motion."""
     out: dict[int, Bend] = {}
     for component in sorted(set(graph.components.values())):
         mine = [k for k in sorted(placed) if graph.components[k] == component]

@@ -1,9 +1,9 @@
-"""Align two sets of corresponding points: a robust similarity, and how far it can be trusted (paper 3.2, A.3, A.4).
+"""Align two sets of corresponding points: a robust similarity and its covariance (paper 3.2, A.3, A.4).
 
 Both sides are noisy, so the fit is symmetric: the scale at which neither side is shrunk, with rotation and translation
-after Umeyama. Outliers are let go of in two steps: a start that up to about half of the frames being misplaced
-together does not spoil, then Tukey's biweight. The covariance is measured, not assumed: errors within a frame go
-together, so whole frames are left out in turn; a reconstruction bends slowly along a chunk, so whole thirds are too.
+after Umeyama. Outliers are removed in two steps: a start that tolerates up to about half of the frames being misplaced
+together, then Tukey's biweight. The covariance is measured, not assumed: errors within a frame are correlated, so whole
+frames are left out in turn; a reconstruction deforms slowly along a chunk, so whole thirds are too.
 """
 
 from __future__ import annotations
@@ -29,34 +29,33 @@ class AlignmentSettings:
     least_groups: int = 1
     """Fewest groups (shared frames)."""
     start_pairs: int = 3000
-    """Pairs that the robust start works on; the fit itself uses all."""
+    """Pairs for the robust start; the fit itself uses all."""
     start_iterations: int = 40
     """Most rounds of re-weighting of the robust start."""
     huber_quantile: float = 0.2
-    """Share of the residuals inside the quadratic part of the start's kernel: near to least absolute deviations, it
-    lets go of a third of the frames being misplaced together, where their median itself is spoilt."""
+    """Share of the residuals inside the quadratic part of the start's kernel: close to least absolute deviations, it
+    tolerates a third of the frames being misplaced together, where their median is an outlier itself."""
     iterations: int = 20
     """Most rounds of re-weighting of the fit."""
     kernel: float = 4.0
-    """Residual beyond which a pair has no say (Tukey's biweight), in medians of the residuals: 6.2 standard deviations
-    of one coordinate where noise is Gaussian, which gives up 4 % of the efficiency of least squares."""
+    """Residual beyond which a pair has no weight (Tukey's biweight), in medians of the residuals: 6.2 standard
+    deviations of one coordinate for Gaussian noise, which costs 4 % of the efficiency of least squares."""
     residual_scale: float = 0.02
     """Residual at which a pair counts 1/e in the confidence m_uv, as a share of the points' spread (sigma_r)."""
     most_angle_sigma_rad: float = 0.35
-    """Standard deviation of an angle beyond which the rotation counts as open."""
+    """Standard deviation of an angle beyond which the rotation counts as undetermined."""
     most_scale_sigma: float = 0.35
-    """Standard deviation of the log scale beyond which the scale counts as open."""
+    """Standard deviation of the log scale beyond which the scale counts as undetermined."""
     least_width: float = 1e-4
-    """Second extent of the points as a share of the first, below which they lie on one line."""
+    """Second extent of the points as a share of the first, below which they are on one line."""
     line_noise: float = 0.25
-    """Points lie on one line beside their noise where their second extent (squared) is below this share of the noise
-    and"""
+    """Points are on one line up to noise where their second extent (squared) is below this share of the noise and"""
     line_share: float = 0.01
     """below this share of the first extent (squared)."""
     bending_gain: float = 10.0
-    """Variance added for bending, in units of what the shared frames' own walk shows. In simulation 10 holds where the
-    bending goes together over a tenth to a third of the shared frames; what bends more slowly than the frames that
-    are shared cannot be seen in them and asks for more."""
+    """Variance added for deformation, in units of the random walk that the shared frames show. In simulation 10
+    suffices where the deformation is correlated over a tenth to a third of the shared frames; slower deformation
+    cannot be seen in them and needs more."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +70,23 @@ class Alignment:
     confidence: float
     """m_uv of the paper (A.4), in [0, 1]."""
     residual: Array
-    """Distance of each pair after alignment, v's units, infinite where a pair was not used. Shape (N,)."""
+    """Distance of each pair after alignment, v's units, infinite for unused pairs. Shape (N,)."""
     inside: NDArray[np.bool_]
-    """Pairs that agree with the fit. Shape (N,)."""
+    """Inlier pairs of the fit. Shape (N,)."""
     rms: float
-    """Root mean square residual of those, v's units."""
+    """Root mean square residual of the inliers, v's units."""
     spread: float
-    """Diagonal of the box round the points of v, 5 % trimmed at either end, v's units."""
+    """Diagonal of the bounding box of the points of v, 5 % trimmed at either end, v's units."""
     close: float
-    """Share of the weight that lies within three residual scales (sigma_r), in [0, 1]."""
+    """Share of the weight within three residual scales (sigma_r), in [0, 1]."""
     groups: int
-    """Groups that had a say."""
+    """Groups with a weight."""
     bending: float
-    """How much more the thirds of the groups disagree than the groups' own scatter explains; 1 for no bending."""
+    """Disagreement of the thirds of the groups over that explained by the groups' scatter; 1 without deformation."""
 
     @property
     def inliers(self) -> int:
-        """Number of pairs that agree."""
+        """Number of inlier pairs."""
         return int(self.inside.sum())
 
 
@@ -103,7 +102,7 @@ def align(
 
     `p_u` and `p_v` have shape (N, 3); `weight` (N,) is >= 0, a pair of weight 0 or with a coordinate that is not finite
     is left out; `group` (N,) int numbers the frame of each pair, in order of time. Raises `DegenerateError` for support
-    that does not determine the transform, naming what is wrong with it. Formulas: Umeyama 1991; Beaton and Tukey 1974;
+    that does not determine the transform, with the reason. Formulas: Umeyama 1991; Beaton and Tukey 1974;
     Bell and McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples", 2002.
     """
     chosen = settings or AlignmentSettings()
@@ -143,8 +142,8 @@ def robust_start(
     metric: bool,
     settings: AlignmentSettings | None = None,
 ) -> Sim3:
-    """Return the transform that `align` starts from: by few of the pairs, not exact, but spoilt neither by scattered
-    outliers nor by up to about half of the frames being misplaced together. Raises `DegenerateError`."""
+    """Return the transform that `align` starts from: from few of the pairs, not exact, but robust to scattered outliers
+    and to up to about half of the frames being misplaced together. Raises `DegenerateError`."""
     chosen = settings or AlignmentSettings()
     pairs, _ = _usable(_Pairs.build(p_u, p_v, weight, group), chosen)
     return _robust_start(pairs.thinned(chosen.start_pairs), metric, _spread(pairs.v), chosen)
@@ -184,7 +183,7 @@ class _Pairs:
 
 
 def _usable(every: _Pairs, settings: AlignmentSettings) -> tuple[_Pairs, NDArray[np.bool_]]:
-    """Return the pairs that can be used, and which they are. Raises `DegenerateError` when they are too few."""
+    """Return the usable pairs, and their mask. Raises `DegenerateError` when they are too few."""
     finite = np.isfinite(every.u).all(axis=1) & np.isfinite(every.v).all(axis=1) & np.isfinite(every.weight)
     used = finite & (every.weight > 0)
     count, least = int(used.sum()), settings.least_pairs
@@ -197,14 +196,14 @@ def _usable(every: _Pairs, settings: AlignmentSettings) -> tuple[_Pairs, NDArray
         raise DegenerateError(f"{len(every.u)} pairs of points do not determine a transform; {least} are needed")
     groups = len(np.unique(every.group[used]))
     if groups < settings.least_groups:
-        raise DegenerateError(f"the pairs lie in {groups} frames; at least {settings.least_groups} are needed")
+        raise DegenerateError(f"the pairs are in {groups} frames; at least {settings.least_groups} are needed")
     pairs = every[used]
     for side in (pairs.u, pairs.v):
         spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(side.T, aweights=pairs.weight)), 0.0))
         if not spread[2] > 1e-9 * np.abs(side).max():
             raise DegenerateError("the points have no extent: rotation and scale are undetermined")
         if spread[1] < settings.least_width * spread[2]:
-            raise DegenerateError("the points lie on one line, so the rotation about it is undetermined")
+            raise DegenerateError("the points are on one line, so the rotation about it is undetermined")
     return pairs, used
 
 
@@ -217,9 +216,9 @@ def _spread(points: Array) -> float:
 
 
 def _fit(pairs: _Pairs, weight: Array, metric: bool, symmetric: bool) -> Sim3:
-    """Fit by weighted Umeyama. The symmetric scale is the geometric mean of the least squares ones of both directions,
-    the maximum likelihood where both sides are equally noisy relative to their size (Deming regression); least squares
-    itself shrinks towards zero with the noise of u."""
+    """Fit by weighted Umeyama. The symmetric scale is the geometric mean of the least squares scales of both
+    directions, the maximum likelihood where both sides are equally noisy relative to their size (Deming regression);
+    least squares itself shrinks towards zero with the noise of u."""
     w = weight / weight.sum()
     mean_u, mean_v = w @ pairs.u, w @ pairs.v
     du, dv = pairs.u - mean_u, pairs.v - mean_v
@@ -236,7 +235,7 @@ def _fit(pairs: _Pairs, weight: Array, metric: bool, symmetric: bool) -> Sim3:
 
 
 def _robust_start(pairs: _Pairs, metric: bool, spread: float, settings: AlignmentSettings) -> Sim3:
-    """Return better of two starts: least absolute deviations over all pairs, and the best fit of one group alone."""
+    """Return the better of two starts: least absolute deviations over all pairs, and the best fit of one group."""
     starts = [_least_absolute(pairs, metric, spread, settings), *_fits_of_groups(pairs, metric)]
     residuals = [pairs.residual(S) for S in starts]
     scale = max(min(float(np.median(r)) for r in residuals), 1e-12 * spread)
@@ -259,7 +258,7 @@ def _least_absolute(pairs: _Pairs, metric: bool, spread: float, settings: Alignm
 
 
 def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
-    """Return fits of single groups that hold enough, spread over all groups."""
+    """Return fits of single groups with enough pairs, spread over all groups."""
     values, counts = np.unique(pairs.group, return_counts=True)
     values = values[counts >= 8]
     if len(values) > most:
@@ -269,20 +268,20 @@ def _fits_of_groups(pairs: _Pairs, metric: bool, most: int = 24) -> list[Sim3]:
 
 
 def _corners(points: Array) -> Array:
-    """Return corners of the points' box: what two transforms do there bounds what they do inside. Shape (8, 3)."""
+    """Return the corners of the points' box: two transforms differ inside by no more than there. Shape (8, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     return np.asarray(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high))
 
 
 def _moved(S_a: Sim3, S_b: Sim3, corners: Array) -> float:
-    """Return how far two transforms carry the points apart."""
+    """Return the largest distance of the points under two transforms."""
     return float(np.abs(S_a.apply(corners) - S_b.apply(corners)).max())
 
 
 def _refine(
     pairs: _Pairs, start: Sim3, metric: bool, spread: float, settings: AlignmentSettings
 ) -> tuple[Sim3, Array, float]:
-    """Return fit under Tukey's biweight: transform, trust in each pair (N,), and residual beyond which it is none."""
+    """Return the fit under Tukey's biweight: transform, weight of each pair (N,), and residual of zero weight."""
     S_v_u, corners = start, _corners(pairs.u)
     for k in range(settings.iterations):
         residual = pairs.residual(S_v_u)
@@ -298,21 +297,21 @@ def _refine(
 
 
 def _check_extent(p: Array, q: Array, weight: Array, settings: AlignmentSettings) -> None:
-    """Raise `DegenerateError` for a line that only noise makes thick: both sides do not agree on what makes it so."""
+    """Raise `DegenerateError` for a line that only noise makes thick: the two sides disagree across it."""
     w = weight / weight.sum()
     dp, dq = p - w @ p, q - w @ q
     together = (w[:, None] * dp).T @ dq
     _, across, along = np.linalg.eigvalsh((together + together.T) / 2.0)
     noise = float(w @ ((dp - dq) ** 2).sum(axis=1)) / 3.0
     if across < min(settings.line_noise * noise, settings.line_share * along):
-        raise DegenerateError("within their noise the points lie on one line, so the rotation about it is undetermined")
+        raise DegenerateError("within their noise the points are on one line, so the rotation about it is undetermined")
 
 
 def _check_determined(covariance: Array, metric: bool, settings: AlignmentSettings) -> None:
     angle = float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[2], 0.0)))
     if not angle < settings.most_angle_sigma_rad:
         raise DegenerateError(
-            f"the rotation is undetermined (to {angle:.2g} rad): within their noise the points lie on a line or a spot"
+            f"the rotation is undetermined (to {angle:.2g} rad): within their noise the points are on a line or a spot"
         )
     scale = float(np.sqrt(max(covariance[6, 6], 0.0)))
     if not metric and not scale < settings.most_scale_sigma:

@@ -1,9 +1,9 @@
-"""How far an alignment can be trusted: its covariance, measured on the pairs themselves.
+"""The covariance of an alignment, measured on the pairs themselves.
 
-Errors within a frame go together, so whole frames are left out in turn (the delete-a-group jackknife: Bell and
+Errors within a frame are correlated, so whole frames are left out in turn (the delete-a-group jackknife: Bell and
 McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples", 2002). A reconstruction
-bends slowly along its frames, so whole thirds of them are too; what the thirds disagree more than single frames
-explain is added.
+deforms slowly along its frames, so whole thirds of them are too; the thirds' disagreement beyond that of single frames
+is added.
 """
 
 from __future__ import annotations
@@ -24,23 +24,22 @@ _BANDS = 8
 """Parts of a single frame that are left out in turn where there is no other frame."""
 
 _BENDING_SEEN = 2.0
-"""Ratio of disagreements beyond which thirds differ for a reason: without one it is chi^2 / 14 with 14 degrees of
-freedom, beyond 2 in 1.4 % of cases."""
+"""Ratio of disagreements beyond which thirds differ significantly: without deformation it is chi^2 / 14 with 14
+degrees of freedom, beyond 2 in 1.4 % of cases."""
 _SINGLE_FRAME = 4.0
-"""Variance is taken so many times larger where one frame is all there is: an error that the whole of it shares cannot
-be seen in it."""
+"""Factor on the variance where there is only one frame: an error that the whole frame shares is not visible in it."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What is known of an alignment's error."""
+    """The error of an alignment."""
 
     covariance: Array
     """Of the tangent error x in S_true = S_v_u exp(x), x = (rho, omega, sigma) in u's units. Shape (7, 7)."""
     groups: int
-    """Groups that had a say."""
+    """Groups with a weight."""
     bending: float
-    """How much more the thirds of the groups disagree than the groups' own scatter explains; 1 for no bending."""
+    """Disagreement of the thirds of the groups over that explained by the groups' scatter; 1 without deformation."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +49,13 @@ class FittedPairs:
     p_u: Array
     """Points of u, in u. Shape (N, 3)."""
     q_u: Array
-    """Points of v, brought to u by the fit. Shape (N, 3)."""
+    """Points of v, moved to u by the fit. Shape (N, 3)."""
     weight: Array
     """As given to the fit. Shape (N,)."""
     trust: Array
     """Factor of the biweight on the weight, 0 from `limit_u` on. Shape (N,)."""
     limit_u: float
-    """Residual beyond which a pair has no say, u's units."""
+    """Residual beyond which a pair has no weight, u's units."""
     group: NDArray[np.int64]
     """Number of the frame of each pair, in order of time. Shape (N,)."""
 
@@ -91,19 +90,19 @@ def measure_uncertainty(pairs: FittedPairs, metric: bool, bending_gain: float = 
 
 @dataclass(frozen=True)
 class _Terms:
-    """What the pairs say, summed by group, about the centre of the points and in levers."""
+    """Information and score of the pairs, summed by group, about the centre of the points and in levers."""
 
     information: Array
     """Shape (G, D, D)."""
     score: Array
     """Shape (G, D)."""
     frames: int
-    """Groups; where there is a single one, its pairs in order are cut into bands that stand in for groups."""
+    """Groups; the pairs of a single one are cut, in order, into bands that replace groups."""
 
     @staticmethod
     def build(pairs: FittedPairs, size: int) -> _Terms:
-        """Sum the estimating equations of the symmetric fit: those of least squares with the Jacobian at the middle of
-        the two noisy points. The information is the exact second derivative of the biweight."""
+        """Sum the estimating equations of the symmetric fit: those of least squares with the Jacobian at the midpoint
+        of the two noisy points. The information is the exact second derivative of the biweight."""
         p, q, weight, trust, group = pairs.p_u, pairs.q_u, pairs.weight, pairs.trust, pairs.group
         order = np.argsort(group, kind="stable")
         order = order[trust[order] > 0]
@@ -136,7 +135,7 @@ def _left_out(information: Array, score: Array) -> Array:
 
 
 def _steadied(scatter: Array, information: Array, count: int) -> Array:
-    """Return the scatter of G groups, drawn towards the shape of the inverse information the fewer groups there are."""
+    """Return the scatter of G groups, shrunk towards the inverse information; more for fewer groups."""
     root, inverse_root = _roots(information)
     white = root @ scatter @ root
     size = len(scatter)

@@ -1,4 +1,4 @@
-"""Spread the support of an edge evenly: every patch of the picture has one say in every frame (paper A.3)."""
+"""Spread the support of an edge evenly: every patch of the picture counts once in every frame (paper A.3)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CHI2_MEDIAN = 0.455
 
 @dataclass(frozen=True)
 class BalancedSupport:
-    """M correspondences spread evenly over what stands still."""
+    """M correspondences spread evenly over the static surfaces."""
 
     p_u: Floats
     """In u. Shape (M, 3)."""
@@ -29,19 +29,19 @@ class BalancedSupport:
     frame: Ints
     """Frame.index. Shape (M,)."""
     used: Mask
-    """Pairs that went into them. Shape (N,)."""
+    """Pairs that contributed. Shape (N,)."""
 
 
 def balanced_support(
     pairs: Pairs, static: StaticSupport, camera: Camera, settings: EdgeSupportSettings
 ) -> BalancedSupport:
-    """Return one correspondence for each patch of what stands still: a block of the picture in one region of one frame.
+    """Return one correspondence for each static patch: a block of the picture in one region of one frame.
 
-    Pairs of one patch err together, so what a patch is worth does not grow with its pairs for long, and neither a wall
-    nor a confident thing crowds out the rest. How far patches of a region err, and pairs within them, is measured by
-    how much the two chunks disagree on them within frames, not taken from the model's confidence: things that it
-    doubts without cause come in again. All frames have the same say, because the error of its pose is common to all
-    that a frame shows; and near patches have no more than far ones, which hold rotation and scale.
+    Errors of pairs in one patch are correlated, so a patch's weight saturates with its pairs, and neither a wall nor a
+    confident instance outweighs the rest. The errors of a region's patches, and of pairs within them, are measured by
+    the disagreement of the two chunks within frames, not taken from the model's confidence: surfaces with wrongly low
+    confidence count again. All frames have the same weight, because all points of a frame share its pose error; near
+    patches weigh no more than far ones, which determine rotation and scale.
     """
     usable = ~static.removed
     regions = divide(pairs, pairs.instance_u, camera, settings)
@@ -92,7 +92,7 @@ def _patches(
 
 
 def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: EdgeSupportSettings) -> Floats:
-    """Return trust in each pair: Tukey's biweight of how far along ray it lies from its patch's median. Shape (N,)."""
+    """Return the weight of each pair: Tukey's biweight of its distance along the ray from its patch's median. (N,)."""
     trust = np.zeros(len(off))
     rows = np.flatnonzero(usable)
     if not len(rows):
@@ -113,8 +113,8 @@ def _within_patch(off: Floats, patch: Ints, count: int, usable: Mask, settings: 
 def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, settings: EdgeSupportSettings) -> Floats:
     """Return information of each pair, relative to its depth: its share of 1 / (t^2 + s^2 / n) of its patch of n pairs.
 
-    t is the deviation of whole patches of its region, s that of pairs within them, both robust, and drawn towards those
-    of all regions where a region has little to tell them by. Shape (N,).
+    t is the deviation of whole patches of its region, s that of pairs within them, both robust, and shrunk towards
+    those of all regions where a region has few. Shape (N,).
     """
     number = np.bincount(patch, trust)
     mean = np.stack([np.bincount(patch, trust * off[:, k]) for k in range(3)], axis=1)
@@ -140,5 +140,5 @@ def _information(off: Floats, patch: Ints, regions: Regions, trust: Floats, sett
 
 
 def _variance(squares: Floats) -> float:
-    """Return robust variance from squared deviations, which lie mostly along ray: their median over that of chi^2_1."""
+    """Return robust variance from squared deviations, mostly along the ray: their median over that of chi^2_1."""
     return median(squares) / _CHI2_MEDIAN if len(squares) else 0.0

@@ -1,7 +1,7 @@
-"""Measure the relation of two chunks by the cameras of the frames that they share.
+"""Measure the relation of two chunks from the camera poses of their shared frames.
 
-Structure from motion places cameras far better than surfaces (research/association 0048). The path must be long enough
-to tell the scale; otherwise the edge by points stays.
+Structure from motion determines cameras far better than surfaces (research/association 0048). The path must be long
+enough to determine the scale; otherwise the edge by points stays.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CameraEdgeSettings:
-    """When the cameras are believed."""
+    """When the camera poses are used."""
 
     least_frames: int = 6
     """Fewest shared frames."""
     correlated: float = 10.0
-    """So many neighbouring frames tell as much as one: their errors go together."""
+    """Number of neighbouring frames that count as one: their errors are correlated."""
     most_scale_sigma: float = 0.25
     """Largest standard deviation of the logarithm of the scale."""
     least_turn_rad: float = 1e-3
-    """Error of a camera's direction that is always reckoned with."""
+    """Least error of a camera's direction."""
     least_shift: float = 0.005
-    """Error of a camera's place that is always reckoned with, by the length of the shared path."""
+    """Least error of a camera's position, as a share of the length of the shared path."""
     rounds: int = 10
 
 
@@ -78,7 +78,7 @@ def camera_edge(
 
 
 ONE_FRAME = {"one_frame": 1.0}
-"""Scores of an edge between chunks that lie in one frame of reference and scale from the start."""
+"""Scores of an edge between chunks that have one frame of reference and scale from the start."""
 
 
 def one_frame_edge(u: FrameSamples, v: FrameSamples, u_id: int, v_id: int) -> Edge | None:
@@ -92,12 +92,12 @@ def one_frame_edge(u: FrameSamples, v: FrameSamples, u_id: int, v_id: int) -> Ed
 
 
 def in_one_frame(edge: Edge) -> bool:
-    """Tell whether the chunks of an edge lie in one frame of reference and scale from the start."""
+    """Return whether the chunks of an edge have one frame of reference and scale from the start."""
     return "one_frame" in edge.scores
 
 
 def better_edge(by_points: Edge | None, by_cameras: Edge | None) -> Edge | None:
-    """Return the edge by cameras where there is one, with the scores of the points; else that by points."""
+    """Return the edge by cameras if there is one, with the scores of the points; else the edge by points."""
     if by_cameras is None or by_points is None:
         return by_cameras or by_points
     scores = {**by_points.scores, **by_cameras.scores, "spread": by_points.scores["spread"]}
@@ -127,7 +127,7 @@ def _angles(rotations: Array) -> Array:
 
 
 def _covariance(places: Array, shift: float, turn: float, settings: CameraEdgeSettings) -> Array | None:
-    """Return covariance of x = (rho, omega, sigma) in u's units, from errors of places and directions of cameras."""
+    """Return covariance of x = (rho, omega, sigma) in u's units, from errors of camera positions and directions."""
     information = np.zeros((7, 7))
     for place in places:
         J = np.concatenate([np.eye(3), -skew(place), place[:, None]], axis=1)

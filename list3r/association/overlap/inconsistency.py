@@ -1,12 +1,12 @@
-"""Measure how far two chunks place a region apart, against what stands still (paper 3.2 and A.3).
+"""Measure how far apart two chunks place a region, against the static regions (paper 3.2 and A.3).
 
-A region moves when the two chunks place it differently from what surrounds it. The paper measures that in pixels,
+A region moves when the two chunks place it differently from its surroundings. The paper measures that in pixels,
 
     delta(o) = mean over p in Omega_o of | pi(S_v_u P_u(p)) - phi_uv(p) |,
 
-with phi_uv(p) = p on shared frames. A pixel residual cannot see a thing that is displaced along the ray, which is what
-a moving thing mostly does there (its rays are given by the frame), so the share of its depth by which it is displaced
-along the ray is measured beside it. Both are held against what the static regions show, never against a fixed limit.
+with phi_uv(p) = p on shared frames. A pixel residual is blind to displacement along the ray, which is most of a moving
+object's displacement there (its rays are given by the frame), so displacement along the ray is measured too, as a share
+of depth. Both are compared with those of the static regions, never with a fixed limit.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from list3r.memory.geometry import Sim3
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far the two chunks place each of N pairs apart."""
+    """Distance at which the two chunks place each of N pairs."""
 
     share: Floats
     """In the camera of v, as a share of the depth. Shape (N, 3)."""
     delta_px: Floats
     """In the picture. Shape (N,)."""
     sure: Mask
-    """Pairs that confidence alone would take. Shape (N,)."""
+    """Pairs with enough confidence. Shape (N,)."""
     rest: Mask
-    """Those of them that were not removed. Shape (N,)."""
+    """Confident pairs that were not removed. Shape (N,)."""
 
 
 @dataclass(frozen=True)
 class Inconsistency:
-    """How far the two chunks place each of R regions apart."""
+    """Displacement of each of R regions between the two chunks."""
 
     delta_px: Floats
     """The paper's delta. Shape (R,)."""
     excess: Floats
-    """How many times what a static region is off by at most; 0 where there are too few pairs to judge. Shape (R,)."""
+    """Displacement over the largest one of static regions; 0 with too few pairs. Shape (R,)."""
 
     @property
     def moving(self) -> Mask:
@@ -52,11 +52,11 @@ class Inconsistency:
 
 
 def displacement(pairs: Pairs, S_v_u: Sim3, camera: Camera, sure: Mask, removed: Mask) -> Displacement:
-    """Measure how far the two chunks place each pair apart.
+    """Measure how far apart the two chunks place each pair.
 
-    The pose error of a frame displaces all that the frame shows and says nothing of motion, so points are compared in
-    the camera of their frame, each chunk's by its own pose, after the frame's common change of scale is taken out;
-    where the poses of the two chunks agree worse than their points do, in chunk v.
+    A frame's pose error displaces all its points and is no motion, so points are compared in the camera of their frame,
+    each chunk's by its own pose, after the frame's common change of scale is removed; where the poses of the two chunks
+    agree worse than their points do, in chunk v.
     """
     off_world = moved(pairs.T_cam_v, S_v_u.apply(pairs.p_u)) - pairs.cam_v
     depth = np.maximum(pairs.cam_v[:, 2], 1e-9)
@@ -72,8 +72,7 @@ def displacement(pairs: Pairs, S_v_u: Sim3, camera: Camera, sure: Mask, removed:
 def inconsistency(
     off: Displacement, regions: Regions, frame: Ints, camera: Camera, settings: EdgeSupportSettings
 ) -> Inconsistency:
-    """Tell how far each region is off, and whether that is more than what stands still is off by. `frame` has shape
-    (N,)."""
+    """Return each region's displacement, and its ratio to the largest one of static regions. `frame` has shape (N,)."""
     sure, rest = off.sure, off.rest
     medians, row, weight = _by_region_and_frame(off.share, regions, frame, sure)
     total = np.maximum(np.bincount(row, weight, len(regions.count)), 1e-12)
@@ -122,7 +121,7 @@ def _by_region_and_frame(share: Floats, regions: Regions, frame: Ints, sure: Mas
 def _limit(
     value: Floats, still: NDArray[np.signedinteger], judged: Mask, settings: EdgeSupportSettings, least: float
 ) -> float:
-    """Return what a static region is off by at most, from those that were not removed."""
+    """Return the largest displacement of a static region, from the regions that were not removed."""
     vote = np.asarray(np.sqrt(still) * judged, np.float64)
     if not vote.any():
         return float("inf")

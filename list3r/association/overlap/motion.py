@@ -1,11 +1,11 @@
-"""Find what moves inside one chunk, by the chunk's own poses and the mask tracks (paper A.3, within a subsequence).
+"""Find the instances that move inside one chunk, from its own poses and mask tracks (paper A.3, within a subsequence).
 
-A thing that stands still is found again where it was: its points of frame a, projected into frame b, meet it there, or
-something nearer hides them, or they lie outside. A thing that moved leaves its place: frame b sees through its points
-to what lies behind. Seeing through is what is counted, because it is the one thing that neither another viewpoint, nor
-being half hidden, nor a mask that leaks, breaks or changes hands can cause; and since each frame is held against each
-other in both directions, a thing that moves along the ray is caught as well (its later points float before what the
-earlier frame saw). What counts as "behind" follows from how well the static part of the chunk agrees with itself.
+Points of a static instance in frame a, projected into frame b, meet the instance there, are occluded, or are outside.
+An instance that moved leaves its place: frame b sees through its points to a surface behind. Only seeing through is
+counted, because neither another viewpoint, nor occlusion, nor a mask that leaks, breaks or changes its object can cause
+it; and since all pairs of frames are compared in both directions, motion along the ray is found as well (the later
+points float before the surface that the earlier frame saw). The least step that counts as "behind" follows from the
+depth consistency of the chunk's static part.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ class MotionSettings:
     """When an instance counts as moving."""
 
     frames: int = 24
-    """Frames, spread over the chunk, that are held against one another."""
+    """Frames, spread over the chunk, that are compared with each other."""
     grid: tuple[int, int] = (64, 48)
     """Columns and rows of the depth grid of a frame."""
     deviations: float = 5.0
-    """Robust deviations of the static part's depth beyond which a point is seen through."""
+    """Robust standard deviations of the static part's depth beyond which a point is seen through."""
     static_quantile: float = 0.4
-    """Quantile of the disagreement of two frames that tells the deviation of what stands still: things that move over
-    half of the picture do not reach it."""
+    """Quantile of the disagreement of two frames that gives the deviation of static surfaces: movers over half of the
+    picture do not reach it."""
     least_step: float = 0.03
-    """Least share of the depth by which what lies behind must be farther."""
+    """Least distance of the surface behind, as a share of the depth."""
     footprint: float = 1.5
     """A point within this many sample spacings of its instance's own points in the other frame is found again."""
     least_points: int = 5
@@ -52,11 +52,11 @@ class MotionSettings:
     least_pairs: int = 6
     """Fewest pairs of frames on which an instance is judged."""
     pair_quantile: float = 0.75
-    """An instance is judged by this quantile over its pairs of frames: it may stand still for most of the chunk."""
+    """An instance is judged by this quantile over its pairs of frames: it may be static for most of the chunk."""
     least_share: float = 0.4
-    """Share of the points seen again that are seen through, from which the instance moves."""
+    """Least share of the visible points that are seen through for an instance to move."""
     smoothing_frames: int = 3
-    """Frames on either side that steady a position, the fuller views counting for more."""
+    """Frames on either side that smooth a position, larger views weighing more."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class _Samples:
 
 @dataclass(frozen=True)
 class _DepthGrid:
-    """What one frame sees, on a coarse grid."""
+    """Depth of one frame on a coarse grid."""
 
     nearest: Floats
     """Least depth in the neighbourhood of a cell, infinite where nothing is known. Shape (h, w)."""
@@ -94,9 +94,9 @@ class _DepthGrid:
 def flag_dynamic(
     samples: FrameSamples, library: LocalLibrary, camera: Camera, settings: MotionSettings | None = None
 ) -> LocalLibrary:
-    """Return the library with `dynamic` and `motion` set for what moves against the rest of the chunk.
+    """Return the library with `dynamic` and `motion` set for instances that move against the rest of the chunk.
 
-    `camera` is that of the colour images, whose pixels `samples` number. What is already flagged stays flagged.
+    `camera` is that of the colour images, whose pixels `samples` number. Flags that are set already stay.
     """
     chosen = settings or MotionSettings()
     shares = seen_through(samples, library, camera, chosen)
@@ -147,9 +147,9 @@ def seen_through(
 def motion_track(
     samples: FrameSamples, instance: LocalInstance, settings: MotionSettings | None = None
 ) -> MotionTrack | None:
-    """Return where the middle of what is seen of an instance was, frame by frame; None where it has no points.
+    """Return the median point of an instance, frame by frame; None where it has no points.
 
-    Component-wise medians, steadied over neighbouring frames by how much of the thing each shows.
+    Component-wise medians, smoothed over neighbouring frames by the visible area of the instance.
     """
     chosen = settings or MotionSettings()
     mine = np.flatnonzero((samples.instance == instance.local_id) & np.isfinite(samples.points).all(axis=1))
@@ -166,7 +166,7 @@ def motion_track(
 
 
 def _steadied(frames: Ints, middle: Floats, shown: Floats, settings: MotionSettings) -> Floats:
-    """Return the local straight lines through the positions, weighed by the square of the area shown."""
+    """Return the local straight lines through the positions, weighted by the square of the visible area."""
     out = middle.copy()
     for k, frame in enumerate(frames):
         near = np.abs(frames - frame) <= settings.smoothing_frames
@@ -254,7 +254,7 @@ def _depth_steps(
     cell: tuple[Ints, ...],
     settings: MotionSettings,
 ) -> Floats:
-    """Return share of the depth by which frame k must see farther than points of frame a to see through them. (K, K).
+    """Return the share of the depth by which frame k must see farther than points of frame a to see through. (K, K).
 
     From the 0.4 quantile of the static part's own disagreement, which movers over half of the picture do not reach.
     """
@@ -273,8 +273,8 @@ def _depth_steps(
 
 
 def _found_again(used: _Samples, k: int, behind: Mask, reach: Floats) -> Mask:
-    """Return which points lie within `reach` (S,) of their own instance's points in frame k: thin things slip through
-    the depth grid. Shape (S,)."""
+    """Return which points are within `reach` (S,) of their own instance's points in frame k: thin instances slip
+    through the depth grid. Shape (S,)."""
     out = np.zeros(len(behind), bool)
     asked = np.flatnonzero(behind)
     own = np.flatnonzero((used.place == k) & (used.instance >= 0))
@@ -288,10 +288,9 @@ def _found_again(used: _Samples, k: int, behind: Mask, reach: Floats) -> Mask:
 
 
 def _judge(again: Floats, through: Floats, visible: Floats, settings: MotionSettings) -> Floats:
-    """Return the quantile of the share seen through, over the half of an instance's pairs of frames that lie farther
-    apart. (I,).
+    """Return the quantile of the share seen through, over the more distant half of an instance's pairs of frames. (I,).
 
-    Both frames of a pair show the instance; what moves slowly still hides behind itself from one frame to the next.
+    Both frames of a pair show the instance; a slow mover still hides behind itself from one frame to the next.
     """
     total = again + through
     both = (visible[:, :, None] >= 3) & (visible[:, None, :] >= 3) & (total >= settings.least_points)

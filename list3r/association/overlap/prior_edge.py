@@ -1,7 +1,7 @@
-"""The relation of two neighbouring chunks by poses that are given but imperfect, with their drift as its weight.
+"""The relation of two neighbouring chunks from given but imperfect poses, with their drift as its weight.
 
-A chunk that was reconstructed with such poses lies in the source's own world by its frames after the last jump. The
-next chunk refers to that world by the frames between the same two jumps.
+A chunk reconstructed with such poses is in the source's own world by its frames after the last jump. The next chunk
+refers to that world by the frames between the same two jumps.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.association.graph.edge_information import about
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkResult, ChunkRow, Edge, FrameRow
-from list3r.reconstruction.prior import PriorSettings, mean_alignment, steady_runs
+from list3r.reconstruction.pose_prior import PriorSettings, mean_alignment, steady_runs
 
 Array = NDArray[np.float64]
 
@@ -24,15 +24,15 @@ class PriorEdgeSettings:
     """How fast given poses drift."""
 
     shift_m: float = 0.01
-    """Deviation of a chunk's place in the source's world, metres, and"""
+    """Standard deviation of a chunk's position in the source's world, metres, and"""
     shift_share: float = 0.02
-    """what it grows by along the path, by its length: twice the drift that ARKit is known for."""
+    """its growth along the path, by its length: twice the drift that ARKit is known for."""
     yaw_deg: float = 0.3
     """The same of the heading,"""
     yaw_deg_per_m: float = 0.2
-    """which drifts,"""
+    """with its growth,"""
     tilt_deg: float = 0.3
-    """and of pitch and roll, which gravity holds."""
+    """and of pitch and roll, which gravity determines."""
     least_frames: int = 6
     """Frames of the next chunk, between two jumps, that place it."""
     steps: PriorSettings = field(default_factory=PriorSettings)
@@ -72,7 +72,7 @@ def prior_edge(
 
 
 def _covariance(center: Array, length_m: float, s: PriorEdgeSettings) -> Array:
-    """Return the covariance of x = (rho, omega, sigma) after a path, turns about `center` (3,). Shape (7, 7)."""
+    """Return the covariance of x = (rho, omega, sigma) after a path, rotations about `center` (3,). Shape (7, 7)."""
     shift = np.hypot(s.shift_m, s.shift_share * length_m)
     yaw = np.radians(np.hypot(s.yaw_deg, s.yaw_deg_per_m * length_m))
     tilt = np.radians(s.tilt_deg)

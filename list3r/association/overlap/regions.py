@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class EdgeSupportSettings:
-    """What counts as confident, as moving, and how the support is spread."""
+    """Limits of confidence and motion, and how the support is spread."""
 
     confidence_share: float = 0.1
     """Least confidence, as a share of the smaller median of the two chunks (VGGT-Long's rule)."""
@@ -26,38 +26,38 @@ class EdgeSupportSettings:
     least_region_pairs: int = 12
     """Fewest pairs on which a region is judged."""
     factor: float = 3.0
-    """A region moves when it is off by this many times what static regions are off by."""
+    """A region moves when its displacement is this many times that of static regions"""
     deviations: float = 6.0
-    """... and by this many robust deviations of the static regions more than they are."""
+    """and this many robust deviations of the static regions more,"""
     least_pixels: float = 0.002
-    """... and by no less than this share of the image's width."""
+    """and at least this share of the image's width"""
     least_depth: float = 0.01
-    """... or, along the ray, this share of its depth."""
+    """or, along the ray, this share of its depth."""
     plainly: float = 3.0
-    """So many times beyond that limit a region plainly moves; short of it it may as well be wrongly followed or
-    badly reconstructed. Both leave the support."""
+    """Multiple of that limit beyond which a region plainly moves; below it may be wrongly tracked or badly
+    reconstructed. Both leave the support."""
     rounds: int = 2
     """Rounds of alignment and removal."""
     hypotheses: int = 6
-    """Largest regions that are tried as what stands still."""
+    """Largest regions that are tried as the static ones."""
     patches: tuple[int, int] = (8, 6)
     """Columns and rows of patches, each of which is one correspondence in each frame and region."""
     prior_patches: int = 60
-    """Patches of a region that tell as much of its errors as all regions together do (errors last over frames)."""
+    """Pseudo-count of patches that shrinks a region's error towards that of all regions (errors last over frames)."""
     least_patches: int = 300
-    """Fewer patches than this are taken apart into their pairs again."""
+    """With fewer patches than this the pairs themselves are used."""
     budget: int = 6000
-    """Most correspondences handed to the alignment."""
+    """Most correspondences of the alignment."""
     patch_kernel: float = 8.0
-    """Distance from its patch's median along the ray beyond which a pair has no say (Tukey's biweight), in medians of
-    that distance."""
+    """Distance from its patch's median along the ray beyond which a pair has no weight (Tukey's biweight), in medians
+    of that distance."""
     prior_pairs: int = 20
-    """Pairs of a region that tell as much of the scatter within patches as all regions together do."""
+    """Pseudo-count of pairs that shrinks a region's scatter within patches towards that of all regions."""
     least_region_share: float = 0.05
     """Least variance of a region's patches, as a share of that of all regions."""
     vote_quantile: float = 0.4
-    """Quantile of the regions' disagreement with a hypothesis that tells how well it can fit: what stands still is more
-    than this share."""
+    """Quantile of the regions' disagreement with a hypothesis that measures its best fit: static regions are more than
+    this share."""
     all_pairs_share: float = 0.98
     """The hypothesis of all pairs is taken where its votes reach this share of the best one's."""
     least_deviation: float = 0.001
@@ -77,13 +77,13 @@ class Regions:
 
 
 def confident(pairs: Pairs, settings: EdgeSupportSettings) -> Mask:
-    """Return pairs that confidence alone would take. Shape (N,)."""
+    """Return pairs with enough confidence. Shape (N,)."""
     least = settings.confidence_share * min(np.median(pairs.confidence_u), np.median(pairs.confidence_v))
     return np.asarray((pairs.confidence_u > least) & (pairs.confidence_v > least))
 
 
 def divide(pairs: Pairs, instance: Ints, camera: Camera, settings: EdgeSupportSettings) -> Regions:
-    """Return regions by one chunk's instances, and by blocks of the picture where there is none."""
+    """Return regions by one chunk's instances, and by blocks of the picture elsewhere."""
     columns, rows = settings.blocks
     block = (pairs.pixel % camera.width) * columns // camera.width
     block = block + columns * ((pairs.pixel // camera.width) * rows // camera.height)

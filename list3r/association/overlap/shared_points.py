@@ -1,4 +1,4 @@
-"""The surface points that two chunks both hold: the same pixel of the same frame in either."""
+"""The surface points of two chunks that correspond: the same pixel of the same frame in either."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Pairs:
-    """N surface points that two chunks both hold."""
+    """N corresponding surface points of two chunks."""
 
     p_u: Floats
     """In u. Shape (N, 3)."""
@@ -53,7 +53,7 @@ class Pairs:
 def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
     """Return the samples at the same pixel of the same frame, finite, with confidence, seen from posed cameras.
 
-    Raises `DegenerateError` when there is none, naming what is missing.
+    Raises `DegenerateError` when there is none, with the reason.
     """
     pick_u, pick_v = shared_samples(u, v)
     if not len(pick_u):
@@ -67,7 +67,7 @@ def shared_pairs(u: FrameSamples, v: FrameSamples) -> Pairs:
     finite = np.isfinite(p_u).all(axis=1) & np.isfinite(p_v).all(axis=1)
     sure = (u.confidence[pick_u] > 0) & (v.confidence[pick_v] > 0)
     for kept, what in (
-        (posed, "lies in a frame whose camera both chunks placed"),
+        (posed, "is in a frame whose camera both chunks posed"),
         (posed & finite, "has finite coordinates in both chunks"),
         (posed & finite & sure, "has a confidence above zero in both chunks"),
     ):

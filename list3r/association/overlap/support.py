@@ -1,7 +1,7 @@
-"""Choose what two chunks are aligned on: the pixels they share, without what moves (paper 3.2 and A.3).
+"""Choose the points on which two chunks are aligned: shared pixels without moving regions (paper 3.2 and A.3).
 
 The same pixel of the same frame is the same surface point in both chunks. Regions are the instances, by the masks of
-either chunk, and blocks of the picture where no mask holds the pixel (`regions`); `inconsistency` tells which move.
+either chunk, and blocks of the picture outside all masks (`regions`); `inconsistency` finds the moving ones.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ Fit = Callable[[Pairs, Mask], Sim3]
 
 @dataclass(frozen=True)
 class StaticSupport:
-    """What of the pairs stands still."""
+    """The static part of the pairs."""
 
     S_v_u: Sim3
-    """The similarity of what stands still, first estimate."""
+    """First estimate of the similarity of the static part."""
     confident: Mask
-    """Pairs that confidence alone would take. Shape (N,)."""
+    """Pairs with enough confidence. Shape (N,)."""
     removed: Mask
-    """Pairs on regions that move. Shape (N,)."""
+    """Pairs on moving regions. Shape (N,)."""
     left_out_u: frozenset[int]
     """Local ids of chunk u whose regions were removed."""
     left_out_v: frozenset[int]
     """Local ids of chunk v whose regions were removed."""
     moving_u: frozenset[int]
-    """Those of chunk u that plainly move."""
+    """Ids of `left_out_u` that plainly move."""
     moving_v: frozenset[int]
-    """Those of chunk v that plainly move."""
+    """Ids of `left_out_v` that plainly move."""
     delta_max_px: float
     """Largest delta of a region that stays."""
 
@@ -56,15 +56,15 @@ class StaticSupport:
 def static_support(
     pairs: Pairs, camera: Camera, fit: Fit, settings: EdgeSupportSettings, known: Mask | None = None
 ) -> StaticSupport:
-    """Find what stands still, and the similarity it agrees on, even where a mover covers half of the pairs.
+    """Find the static part and its similarity, even where a mover covers half of the pairs.
 
-    `known` (N,) are pairs on things that are known to move. Raises `DegenerateError` when no part of the pairs
-    determines a similarity.
+    `known` (N,) are pairs on instances known to move. Raises `DegenerateError` when no part of the pairs determines a
+    similarity.
     """
     sure = confident(pairs, settings)
     known = np.zeros(len(pairs), bool) if known is None else known
     if not (sure & ~known).any():
-        raise DegenerateError("no shared point that stands still has enough confidence in both chunks")
+        raise DegenerateError("no shared static point has enough confidence in both chunks")
     by_u = divide(pairs, pairs.instance_u, camera, settings)
     by_v = divide(pairs, pairs.instance_v, camera, settings)
     S_v_u, doubted = _best_hypothesis(pairs, sure & ~known, by_u, fit, settings)
@@ -98,11 +98,11 @@ def static_support(
 def _best_hypothesis(
     pairs: Pairs, sure: Mask, regions: Regions, fit: Fit, settings: EdgeSupportSettings
 ) -> tuple[Sim3, Mask]:
-    """Return the similarity that most regions agree with (of all pairs, of what has no instance, and of each large
+    """Return the similarity that most regions agree with (of all pairs, of those without an instance, and of each large
     region), and the pairs of the regions that do not.
 
-    A region counts by the square root of its pairs, so that one thing, however large, is outvoted by a few others, and
-    by its extent in space, because what bounds a room is wide.
+    A region counts by the square root of its pairs, so that a few others outvote one large instance, and by its extent
+    in space, because walls and floors are wide.
     """
     held = np.bincount(regions.of_pair, sure, len(regions.count))
     extent = np.array([_extent(pairs.p_v[(regions.of_pair == k) & sure]) for k in range(len(held))])

@@ -1,8 +1,8 @@
-"""Predict the relation of two chunks from the chain of accepted edges between them: a gate for supposed revisits.
+"""Predict the relation of two chunks from the chain of accepted edges between them: a gate for candidate revisits.
 
-Copies of one room differ only in where they are, so comparing what was seen cannot distinguish them; the camera's path
-can. A chain is as uncertain as its edges and as the bending of each chunk on it. A relation that lies far outside of
-that uncertainty is refused.
+Copies of one room differ only in position, so their appearance cannot distinguish them; the camera's path can. A chain
+is as uncertain as its edges and the deformation of each chunk on it. A relation far outside of that uncertainty is
+refused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """How far a chain of edges can be trusted. The deviations are of one chunk of the chain, bending included."""
+    """Uncertainty of a chain of edges. The deviations are of one chunk of the chain, its deformation included."""
 
     shift: float = 0.04
     """Deviation of a shift, as a share of the spread of the edge's points."""
@@ -31,7 +31,7 @@ class ChainSettings:
     log_scale: float = 0.03
     """Deviation of the logarithm of the scale; none where everything is metric."""
     least_confidence: float = 0.05
-    """Confidence that an edge is taken to have at least when the surest path is chosen,"""
+    """Least confidence assumed for an edge when the path of highest confidence is chosen,"""
     least_step_confidence: float = 0.2
     """and when its deviations are widened by one over its confidence."""
     most_deviations: float = 4.5
@@ -40,7 +40,7 @@ class ChainSettings:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A relation of two chunks by the edges between them."""
+    """A relation of two chunks predicted by the edges between them."""
 
     S_v_u: Sim3
     covariance: Array
@@ -53,7 +53,7 @@ class Prediction:
 
 
 class EdgeChains:
-    """The graph of accepted edges, from which many relations are predicted."""
+    """The graph of accepted edges, which predicts many relations."""
 
     def __init__(self, edges: Iterable[Edge], settings: ChainSettings) -> None:
         self._settings = settings
@@ -73,7 +73,7 @@ class EdgeChains:
         return out
 
     def predict(self, u: int, v: int, more: Sequence[Edge] = ()) -> Prediction | None:
-        """Return the relation of two chunks along the surest path, `more` edges added; None if there is no path."""
+        """Return the relation of two chunks along the path of least cost, with `more` edges; None without a path."""
         near = self._near
         if more:
             near = dict(near)
@@ -130,7 +130,7 @@ def _path(near: Mapping[int, list[tuple[int, Edge]]], u: int, v: int, settings: 
 
 
 def _step(edge: Edge, here: int, settings: ChainSettings) -> tuple[Sim3, Array]:
-    """Return the similarity across an edge from the chunk `here`, and its covariance with the bending of one chunk."""
+    """Return the similarity across an edge from the chunk `here`, and its covariance with one chunk's deformation."""
     spread_v = edge.scores.get("spread", 1.0)
     spread_u = spread_v / float(edge.S_v_u.scale)
     forth = here == edge.u

@@ -1,8 +1,8 @@
-"""Test a supposed relation of two chunks against all that both saw (not only what it was made from).
+"""Test a candidate relation of two chunks against all their samples (not only those that it was estimated from).
 
-A reconstruction model that is shown two look-alike places invents a relation between them, and each side fits it well.
-What it cannot invent is the rest of the two chunks: through a false relation, surfaces of one chunk lie in what the
-other saw to be empty, and what lands on a surface is a thing of another kind. Both are counted here, both ways.
+A reconstruction model invents a relation between two similar places, and each side fits it well. It cannot invent the
+rest of the two chunks: under a false relation, surfaces of one chunk are in the other's free space, and overlapping
+instances are of different kinds. Both are counted here, in both directions.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.revisits.cues import InstanceSet
+from list3r.association.revisits.instance_similarity import InstanceSet
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples
@@ -30,26 +30,26 @@ class CrossSettings:
     """When a relation is contradicted."""
 
     points: int = 2500
-    """Most points of one chunk that are looked for in the other."""
+    """Most points of one chunk that are compared with the other."""
     frames: int = 40
-    """Most frames of a chunk in which they are looked for."""
+    """Most frames of a chunk in which they are compared."""
     columns: int = 16
     rows: int = 12
-    """Cells across and down a frame in which depths are compared."""
+    """Grid of a frame in which depths are compared."""
     tolerance: float = 0.08
-    """Depth difference that still agrees, as a share of the depth: noise, bending and drift of a chunk."""
+    """Depth difference that still agrees, as a share of the depth: noise, deformation and drift of a chunk."""
     least_confidence: float = 0.2
-    """Samples of less confidence than this share of the chunk's median say nothing."""
+    """Samples of less confidence than this share of the chunk's median are ignored."""
     least_overlap: float = 0.03
-    """Least share of a side's points that must lie on surfaces that the other side saw."""
+    """Least share of a side's points on surfaces of the other side."""
     least_agreement: float = 0.75
-    """Least share of points on a surface among those on a surface or in space seen to be empty."""
+    """Least share of points on a surface among those on a surface or in free space."""
     least_landed: int = 3
-    """Points of an instance that land on one of the other side before their kinds are compared."""
+    """Least points of an instance on one of the other side for their kinds to be compared."""
     least_kinds: int = 6
-    """Instances that must land on others before their kinds say something."""
+    """Least number of overlapping instances for their kinds to count."""
     least_likeness: float = 0.5
-    """Least mean rank (1 most alike, 0 least, 0.5 by chance) of the instances that land on each other."""
+    """Least mean rank (1 most similar, 0 least, 0.5 by chance) of overlapping instances."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +64,25 @@ class Side:
 
 @dataclass(frozen=True)
 class CrossCheck:
-    """What two chunks say of a relation."""
+    """Agreement of two chunks under a relation."""
 
     overlap: float
     """Share of a side's points on surfaces of the other, the larger of the two, in [0, 1]."""
     agreement: float
-    """Points on surfaces among those on surfaces or in empty space, the smaller of the two, in [0, 1]."""
+    """Points on surfaces among those on surfaces or in free space, the smaller of the two, in [0, 1]."""
     likeness: float
-    """Mean rank of the instances that land on each other, in [0, 1]; NaN where too few do."""
+    """Mean rank of overlapping instances, in [0, 1]; NaN where too few overlap."""
     kinds: int
-    """How many instances landed on others."""
+    """Number of overlapping instances."""
 
     def contradiction(self, settings: CrossSettings) -> str | None:
-        """Return why the relation cannot be true, or None."""
+        """Return why the relation is false, or None."""
         if self.overlap < settings.least_overlap:
             return f"by it the chunks share no surface ({self.overlap:.0%} of their points)"
         if self.agreement < settings.least_agreement:
-            return f"{1 - self.agreement:.0%} of what is compared lies in space that the other chunk saw to be empty"
+            return f"{1 - self.agreement:.0%} of the compared points are in free space of the other chunk"
         if self.likeness < settings.least_likeness:
-            return f"the {self.kinds} things that land on each other are of different kinds ({self.likeness:.2f})"
+            return f"the {self.kinds} instances that overlap are of different kinds ({self.likeness:.2f})"
         return None
 
 
@@ -93,11 +93,11 @@ def cross_check(
     made_from: tuple[Ints, Ints] | None = None,
     settings: CrossSettings | None = None,
 ) -> CrossCheck:
-    """Test a relation. `made_from` are the frames of u and of v that it was made from, which prove nothing together."""
+    """Test a relation. Pairs of `made_from`, the frames of u and of v that it was estimated from, prove nothing."""
     chosen = settings or CrossSettings()
     known = made_from or (np.zeros(0, np.int64), np.zeros(0, np.int64))
-    there = _look(S_v_u, u, v, known[0], known[1], chosen)
-    back = _look(S_v_u.inverse(), v, u, known[1], known[0], chosen)
+    there = _compare(S_v_u, u, v, known[0], known[1], chosen)
+    back = _compare(S_v_u.inverse(), v, u, known[1], known[0], chosen)
     likeness, kinds = _kinds(u.instances, v.instances, np.concatenate([there.landed, back.landed[:, ::-1]]), chosen)
     return CrossCheck(
         overlap=max(there.overlap, back.overlap),
@@ -110,9 +110,9 @@ def cross_check(
 def shared_view(
     S_v_u: Sim3, u: Side, v: Side, frames: tuple[Ints, Ints], settings: CrossSettings | None = None
 ) -> float:
-    """Return the largest share of surface that a frame of u and a frame of v both see through a relation, in [0, 1].
+    """Return the largest share of surface that a frame of u and a frame of v share under a relation, in [0, 1].
 
-    Of the two shares of a pair of frames the smaller one counts. `frames` are those of u and of v that are compared.
+    The smaller of the two shares of a pair of frames counts. `frames` are the compared frames of u and of v.
     """
     chosen = settings or CrossSettings()
     near = replace(chosen, points=4000, frames=10)
@@ -140,7 +140,7 @@ def _only(side: Side, frames: Ints) -> Side:
 
 
 def _seen(S: Sim3, source: Side, target: Side, settings: CrossSettings) -> Array:
-    """Return the share of each source frame's points that lie on what each target frame sees. Shape (Gs, Gt)."""
+    """Return the share of each source frame's points on the surfaces of each target frame. Shape (Gs, Gt)."""
     points, frame, _ = _points(source, settings)
     grids = _grids(target, settings)
     names = source.samples.camera_frames
@@ -161,8 +161,8 @@ def _unit(vectors: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Look:
-    """How points of a source fare in a target."""
+class _Comparison:
+    """Comparison of a source's points with a target."""
 
     overlap: float
     agreement: float
@@ -188,13 +188,15 @@ class _Grids:
     """Frame.index. Shape (G,)."""
 
 
-def _look(S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: Ints, settings: CrossSettings) -> _Look:
-    """Return points of the source, moved by S, in the frames of the target; pairs of frames that are both skipped are
-    not."""
+def _compare(
+    S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: Ints, settings: CrossSettings
+) -> _Comparison:
+    """Compare points of the source, moved by S, with the frames of the target; pairs of frames that are both skipped
+    are left out."""
     points, frame, instance = _points(source, settings)
     grids = _grids(target, settings)
     if not len(points) or not len(grids.frames):
-        return _Look(0.0, 1.0, np.zeros((0, 2), np.int64))
+        return _Comparison(0.0, 1.0, np.zeros((0, 2), np.int64))
     there = S.apply(points)
     agree, through, label = _verdicts(there, grids, target.camera, settings)
     both = np.isin(frame, skip_source)[:, None] & np.isin(grids.frames, skip_target)[None]
@@ -206,7 +208,7 @@ def _look(S: Sim3, source: Side, target: Side, skip_source: Ints, skip_target: I
     hit = share >= 0.5
     pairs = np.stack([instance[judged & hit], landed[judged & hit]], axis=1)
     agreement = float(share[judged].mean()) if judged.any() else 1.0
-    return _Look(float((judged & hit).mean()), agreement, pairs.astype(np.int64))
+    return _Comparison(float((judged & hit).mean()), agreement, pairs.astype(np.int64))
 
 
 def _usable(side: Side, settings: CrossSettings) -> Mask:
@@ -261,9 +263,9 @@ def _spread(depth: Array, take: np.ufunc) -> Array:
 
 
 def _verdicts(points: Array, grids: _Grids, camera: Camera, settings: CrossSettings) -> tuple[Mask, Mask, Ints]:
-    """Return for each point and frame: on a surface, in space seen to be empty, and the instance there. Shapes (N, G).
+    """Return for each point and frame: on a surface, in free space, and the instance there. Shapes (N, G).
 
-    A point is compared with the nearest and the farthest of the samples round it, so that edges between samples are no
+    A point is compared with the nearest and the farthest of the samples around it, so that edges between samples are no
     contradiction.
     """
     cam = np.einsum("gij,nj->ngi", grids.T_cam_chunk[:, :3, :3], points) + grids.T_cam_chunk[:, :3, 3]
@@ -282,7 +284,7 @@ def _verdicts(points: Array, grids: _Grids, camera: Camera, settings: CrossSetti
 
 
 def _kinds(u: InstanceSet, v: InstanceSet, landed: Ints, settings: CrossSettings) -> tuple[float, int]:
-    """Return mean rank, among all of the other chunk, of the feature of the instance that each instance lands on."""
+    """Return the mean rank, in the other chunk, of the feature of the instance that each instance overlaps."""
     if u.space != v.space or len(u.local_id) < 2 or len(v.local_id) < 2 or u.feature.shape[1] != v.feature.shape[1]:
         return float("nan"), 0
     known = np.isin(landed[:, 0], u.local_id) & np.isin(landed[:, 1], v.local_id)

@@ -1,4 +1,4 @@
-"""Find frames that look alike: exact search over the descriptors of all keyframes (research/association 0047)."""
+"""Find similar frames: exact search over the descriptors of all keyframes (research/association 0047)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class DescriptorScale:
-    """What cosines of one kind of frame descriptor mean."""
+    """Meaning of the cosines of one kind of frame descriptor."""
 
     relaxed: float
     """Cosine from which two frames may show one place: the paper's relaxed threshold of 0.5."""
     strict: float
-    """Cosine from which frame similarity alone is believed: VGGT-Long's threshold of 0.85."""
+    """Cosine above which frame similarity alone suffices: VGGT-Long's threshold of 0.85."""
 
     def score(self, cosine: float) -> float:
         """Return s_det in [0, 1]: the cosine on the scale of trained place recognition, 0.5 relaxed and 0.85 strict."""
@@ -32,7 +32,7 @@ class DescriptorScale:
 
 
 TRAINED = DescriptorScale(0.5, 0.85)
-"""Trained place recognition, and what simulates it."""
+"""Trained place recognition, and its simulation."""
 CLASSICAL: Mapping[int, DescriptorScale] = {
     384: DescriptorScale(0.6, 0.75),
     1984: DescriptorScale(0.08, 0.22),
@@ -45,11 +45,11 @@ class SearchSettings:
     """How candidates are chosen."""
 
     exclude_chunks: int = 1
-    """Chunks just before in the same video that are not revisits but neighbours."""
+    """Chunks just before in the same video that are neighbours, not revisits."""
     exclude_frames: int = 30
     """Frames of one video this close are no revisit either."""
     nearest: int = 256
-    """Stored frames looked at for each new one."""
+    """Stored frames compared with each new one."""
     suppress_frames: int = 20
     """A pair within this many frames of a better one, on both sides, is the same revisit."""
     per_chunk: int = 24
@@ -57,15 +57,15 @@ class SearchSettings:
     per_pair: int = 2
     """Most candidates between two chunks."""
     per_pair_of_sessions: int = 6
-    """The same of chunks of two sessions: a short session has few chunks, and what places it must be found twice."""
+    """The same of chunks of two sessions: a short session has few chunks, and its place must be found twice."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Two keyframes that look alike."""
+    """Two similar keyframes."""
 
     u: int
-    """Chunk id of the stored one."""
+    """Chunk id of the stored keyframe."""
     frame_u: int
     """Frame.index."""
     frame_v: int
@@ -108,13 +108,13 @@ class FrameIndices:
     by_length: dict[int, FrameIndex] = field(default_factory=dict)
 
     def clear(self) -> None:
-        """Forget what was read."""
+        """Forget the descriptors that were read."""
         self.checksums.clear()
         self.by_length.clear()
 
 
 def find_candidates(store: Store, chunk_id: int, settings: SearchSettings | None = None) -> list[Candidate]:
-    """Find stored frames that look like frames of a chunk, best first; of chunks that came before it only."""
+    """Find stored frames similar to frames of a chunk, best first; of chunks that came before it only."""
     chosen = settings or SearchSettings()
     rows = {c.chunk_id: c for c in store.chunks.all()}
     own_keys, own = _descriptors(store, [chunk_id])
@@ -174,7 +174,7 @@ def choose(
 
 
 def is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> bool:
-    """Tell whether what two chunks share would be a revisit: the other one came before and is no neighbour."""
+    """Return whether common surfaces of two chunks are a revisit: the other came before and is no neighbour."""
     if there.chunk_id >= here.chunk_id:
         return False
     return there.session_id != here.session_id or (
@@ -183,7 +183,7 @@ def is_revisit(here: ChunkRow, there: ChunkRow, settings: SearchSettings) -> boo
 
 
 def _index(store: Store, chunk_ids: Sequence[int]) -> FrameIndices:
-    """Return index with all of the given chunks in it, read again where a chunk is no longer the one that was read."""
+    """Return index with all of the given chunks in it, read again where a chunk has changed."""
     wanted = set(chunk_ids)
     checksums = {k: c for k, c in store.chunks.checksums().items() if k in wanted}
     known = store.derived.of(FrameIndices)
@@ -199,7 +199,7 @@ def _index(store: Store, chunk_ids: Sequence[int]) -> FrameIndices:
 
 
 def _descriptors(store: Store, chunk_ids: Sequence[int]) -> tuple[Ints, Floats]:
-    """Return keys and unit descriptors of some chunks; what is not finite becomes zero and resembles nothing."""
+    """Return keys and unit descriptors of some chunks; one that is not finite becomes zero, similar to nothing."""
     keys, descriptors = store.keyframes.descriptors(chunk_ids)
     if not len(keys):
         return keys, np.zeros((0, 0), np.float32)

@@ -1,8 +1,8 @@
 """Joint windows: frames of two places reconstructed together once more (paper 3.2; a loop pair shares no frame).
 
-Each side of the window shares its frames with one chunk, so that u -> window -> v gives their relation. It is believed
+Each side of the window shares its frames with one chunk, so that u -> window -> v gives their relation. It is accepted
 only when both sides fit, the scale is that of the instances' layout, and the rest of the two chunks does not contradict
-it (`cross_check`): a model that is shown two look-alike places invents a relation, and both sides fit that as well.
+it (`cross_check`): a model invents a relation between two similar places, and both sides fit that as well.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.association.graph.solver import adjoint
 from list3r.association.overlap.alignment import align
-from list3r.association.overlap.edges import EdgeEnd, EdgeSettings, measure_edge
+from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, measure_edge
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.association.revisits.cross_check import CrossSettings, Side, cross_check, shared_view
 from list3r.memory.errors import DegenerateError
@@ -50,19 +50,19 @@ class WindowSettings:
     rough_pairs: int = 600
     """Pairs of points of the first estimate of either side."""
     least_shared: float = 0.15
-    """Least share of surface that two of the window's frames must both see: what shares nothing is invented."""
+    """Least share of surface that two of the window's frames must share: without any the relation is invented."""
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     cross: CrossSettings = field(default_factory=CrossSettings)
 
 
 @dataclass(frozen=True)
 class Place:
-    """One end of a supposed revisit."""
+    """One end of a candidate revisit."""
 
     chunk_id: int
     session_id: int
     frame: int
-    """Frame.index of the frame that looks like one of the other end."""
+    """Frame.index of the frame that is similar to one of the other end."""
     metric: bool
     side: Side
 
@@ -73,7 +73,7 @@ class Place:
 
 
 Objection = Callable[[Sim3], str | None]
-"""Why a relation S_v_u cannot be, or None."""
+"""Why a relation S_v_u is false, or None."""
 
 
 def joint_edge(
@@ -86,7 +86,7 @@ def joint_edge(
     """Return the loop edge from u to v through a joint window, accepted or rejected with the reason.
 
     Without `objection` every edge that can be measured is accepted (the paper's baseline, VGGT-Long). With it a first
-    estimate is put to the test, and only what stands is measured with care.
+    estimate is tested, and only accepted ones are measured with care.
     """
     chosen = settings or WindowSettings()
     frames_u, frames_v = window_frames(u, chosen), window_frames(v, chosen)
@@ -117,7 +117,7 @@ def joint_edge(
 
 
 class _Verdict:
-    """What contradicts a relation; `scores` and `seen` are those of the last one."""
+    """The test of a relation; `scores` and `seen` are those of the last one."""
 
     def __init__(
         self, u: Place, v: Place, made_from: tuple[Ints, Ints], objection: Objection | None, settings: WindowSettings
@@ -129,13 +129,13 @@ class _Verdict:
         self.seen = ""
 
     def of(self, S_v_u: Sim3) -> str | None:
-        """Return why it cannot be, or None."""
+        """Return why it is false, or None."""
         if self._objection is not None and (against := self._objection(S_v_u)):
             return against
         shared = shared_view(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
         self.scores = {"shared_view": shared}
         if shared < self._least_shared:
-            return f"by it no two frames of the places see the same ({shared:.0%} of their surface at most)"
+            return f"under it no two frames of the places share surface ({shared:.0%} at most)"
         check = cross_check(S_v_u, self._u.side, self._v.side, self._made_from, self._settings)
         self.scores |= {"overlap": check.overlap, "agreement": check.agreement, "kinds": float(check.kinds)}
         if np.isfinite(check.likeness):
@@ -145,7 +145,7 @@ class _Verdict:
 
 
 def window_frames(place: Place, settings: WindowSettings) -> Ints:
-    """Return the posed frames of a place's chunk round its frame, ascending (Frame.index)."""
+    """Return the posed frames of a place's chunk around its frame, ascending (Frame.index)."""
     posed = place.side.samples.camera_frames
     middle = int(np.argmin(np.abs(posed - place.frame))) if len(posed) else 0
     span = settings.frames * settings.step

@@ -1,8 +1,8 @@
-"""Estimate the covariance of a relation of two keyframes: what their pairs determine, and what all pairs share.
+"""Estimate the covariance of a relation of two keyframes: the error of their pairs, and a part that all pairs share.
 
-Pairs of two depth images are many and their errors are not independent: depth errs alike over a neighbourhood, and an
-error of the calibration turns or stretches whole images. So the information of the pairs counts as that of a few cells
-of the picture, and a part that all pairs share is added, about the camera. It is the larger part by far
+Pairs of two depth images are many and their errors are correlated: over a neighbourhood by depth, and over whole images
+by an error of the calibration, which rotates or scales them. So the information of the pairs counts as that of a few
+cells of the picture, and a part that all pairs share is added, about the camera. It is the larger part by far
 (research/association 0046).
 """
 
@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from list3r.association.graph.edge_information import about
 from list3r.association.graph.solver import adjoint
 from list3r.memory.geometry import Sim3
-from list3r.reconstruction.rgbd.registration import FrameRegistration
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class KeyframeErrorSettings:
-    """What two keyframes err by together."""
+    """Correlated errors of two keyframes."""
 
     common: float = 0.01
-    """Deviation that all pairs share: a share of the depth for shifts, radians for turns, of the logarithm of scale. A
-    depth camera's focal length is known to about 1 % (7-Scenes: 585 px nominal, 579 px measured)."""
+    """Standard deviation that all pairs share: a share of the depth for shifts, radians for rotations, of the log
+    scale. A depth camera's focal length is known to about 1 % (7-Scenes: 585 px nominal, 579 px measured)."""
     cells: int = 48
     """Parts of the picture whose errors are independent (8 x 6)."""
 
@@ -36,7 +36,7 @@ def registration_covariance(
     found: FrameRegistration, T_chunk_cam: Array, depth: float, settings: KeyframeErrorSettings
 ) -> Array:
     """Return the covariance of a rigid S_v_u through a registration of v's view to u's keyframe at `T_chunk_cam` (4,
-    4), whose middle depth is `depth`: of x in S_true = S_v_u exp(x), u's units, sigma 0. Shape (7, 7).
+    4), whose median depth is `depth`: of x in S_true = S_v_u exp(x), u's units, sigma 0. Shape (7, 7).
 
     S_v_u = T_v T_u_v^-1 T_u^-1, so a left-hand error d of T_u_v is x = -Ad(T_u) d.
     """
@@ -51,8 +51,8 @@ def registration_covariance(
 
 
 def with_scale(covariance: Array, center: Array, deviation: float, unit: float) -> Array:
-    """Return a covariance stated in `unit`s of u (u's coordinates times `unit`), brought to u's own, with an error of
-    the scale about `center` (3,), u's coordinates: surfaces meet there whatever the scale. Shape (7, 7)."""
+    """Return a covariance stated in `unit`s of u (u's coordinates times `unit`), converted to u's own, with an error of
+    the scale about `center` (3,), u's coordinates, where surfaces meet at any scale. Shape (7, 7)."""
     back = np.diag([1.0 / unit] * 3 + [1.0] * 4)
     along = about(center[None])[0][:, 6] * deviation
     return np.asarray(back @ covariance @ back + np.outer(along, along))

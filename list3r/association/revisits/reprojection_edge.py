@@ -1,8 +1,8 @@
-"""A loop between chunks whose depth is rough, refined by where features are seen rather than by how far they are.
+"""Refine a loop between chunks of rough depth by reprojection errors of features rather than by distances.
 
-Depth that was computed is off by several percent and tilts an alignment of points by degrees; the picture tells
-directions to a fraction of a pixel. So the points of either keyframe are projected into the other one, and depth is
-only asked for the ratio of the two scales.
+Computed depth is off by several percent and tilts an alignment of points by degrees; the picture gives directions to a
+fraction of a pixel. So the points of either keyframe are projected into the other one, and depth is used only for the
+ratio of the two scales.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ReprojectionSettings:
-    """How errors of features and of depth are weighed."""
+    """Weights of the errors of features and of depth."""
 
     ratio: float = 0.85
     """Lowe's ratio."""
@@ -33,16 +33,16 @@ class ReprojectionSettings:
     depth_sigma: float = 0.06
     """Error of a depth, share of it."""
     gates: tuple[float, ...] = (40.0, 12.0, 6.0)
-    """Pairs farther off, in deviations, have no say in the rounds of refinement."""
+    """Pairs farther off, in deviations, have no weight in the rounds of refinement."""
     least_pairs: int = 12
     correlated: float = 4.0
-    """So many pairs tell as much as one: their depths err together."""
+    """Number of pairs that count as one: their depth errors are correlated."""
     least_turn_rad: float = 0.004
-    """Error of the direction that is always reckoned with."""
+    """Least error of the direction."""
     least_shift: float = 0.01
-    """Error of the place that is always reckoned with, by the distance of what is seen."""
+    """Least error of the position, as a share of the distance of the points."""
     least_scale: float = 0.03
-    """Error of the logarithm of the scale that is always reckoned with."""
+    """Least error of the log scale."""
 
 
 def refine_loop(
@@ -106,7 +106,7 @@ def _refined_edge(edge: Edge, S_v_u: Sim3, covariance: Array, T_u: Sim3, inliers
         S_v_u=S_v_u,
         covariance=(covariance + covariance.T) / 2.0,
         inliers=inliers,
-        reason=f"{edge.reason}; {inliers} features are seen where its points say",
+        reason=f"{edge.reason}; {inliers} features are seen where its points project",
     )
 
 
@@ -120,7 +120,7 @@ class _Pairs:
     """Points in the camera of v, v's units. Shape (N, 3)."""
     xy_a: Array
     xy_b: Array
-    """Where they are seen, px. Shape (N, 2)."""
+    """Their pixels in v. Shape (N, 2)."""
     camera_a: Camera
     camera_b: Camera
 
@@ -128,7 +128,7 @@ class _Pairs:
         return _Pairs(self.a[kept], self.b[kept], self.xy_a[kept], self.xy_b[kept], self.camera_a, self.camera_b)
 
     def off(self, S_b_a: Sim3, s: ReprojectionSettings) -> Array:
-        """Return residuals in deviations: of picture of v, of that of u, and of the ratio of depths. Shape (N, 5)."""
+        """Return residuals in deviations: reprojection into v and into u, and the ratio of depths. Shape (N, 5)."""
         forth, back = S_b_a.apply(self.a), S_b_a.inverse().apply(self.b)
         ratio = np.log(np.maximum(forth[:, 2], 1e-6) / np.maximum(self.b[:, 2], 1e-6))
         return np.concatenate(

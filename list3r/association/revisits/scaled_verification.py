@@ -1,7 +1,7 @@
 """Verify a revisit of two chunks whose scales are unknown, by the features and depth of one keyframe of each.
 
 Pairs of features with depth on both sides give scale, rotation and translation. With the scale known both keyframes are
-put into like units, in which the scene is as far away as rooms are, and verified as metric ones are.
+converted to common units in which the scene is at room distance, and verified as metric ones are.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from list3r.reconstruction.features.local import match, rigid_fits
 Array = NDArray[np.float64]
 
 _MIDDLE_DEPTH_M = 2.0
-"""Where the middle of what an indoor camera sees is put, so that a sensor's noise and gates in metres make sense."""
+"""Median depth of an indoor camera, to which keyframes are scaled so that gates in metres are meaningful."""
 _TRIALS = 600
 
 
@@ -95,7 +95,7 @@ def _common_scale(a: Array, b: Array, settings: VerificationSettings) -> float |
 
 
 def _similarities(source: Array, target: Array) -> Sim3:
-    """Return what `umeyama` makes of T triples of points (T, 3, 3), where that is determined and no collapse."""
+    """Return the result of `umeyama` for T triples of points (T, 3, 3), where it is determined and not collapsed."""
     mean_x, mean_y = source.mean(axis=1, keepdims=True), target.mean(axis=1, keepdims=True)
     dx, dy = source - mean_x, target - mean_y
     spread, (R, _) = np.linalg.svd(dx, compute_uv=False), rigid_fits(source, target)

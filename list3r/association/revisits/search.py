@@ -1,14 +1,14 @@
 """Find loop closures (paper 3.2 and A.2): frames propose, instances rank, geometry decides.
 
 1. Frame descriptors propose candidates with a relaxed threshold (`frame_search`).
-2. The instances of the two chunks add s_sem and s_rel (`cues`). Candidates are ranked by
+2. The instances of the two chunks add s_sem and s_rel (`instance_similarity`). Candidates are ranked by
    s_loop = lambda s_det + (1 - lambda) (s_sem + s_rel).
 3. The best are verified by the keyframes' features and depth (`verification`) or, where keyframes have none, by a joint
    window (`joint_window`). Where networks make the chunks, a joint window is also tried after features failed.
 4. A relation that the chain of accepted edges contradicts is refused (`chain`).
 
-Every candidate becomes an edge, accepted or not, with its scores and the reason. How the weights were chosen:
-research/association 0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as the paper writes it.
+Every candidate becomes an edge, accepted or not, with its scores and the reason. The choice of the weights:
+research/association 0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as in the paper.
 """
 
 from __future__ import annotations
@@ -20,19 +20,26 @@ from functools import partial
 
 import numpy as np
 
+from list3r.association.revisits.all_keyframes import (
+    WITNESSED,
+    AllKeyframesSettings,
+    contradicted,
+    place_by_all_keyframes,
+)
 from list3r.association.revisits.chain import ChainSettings, EdgeChains, Prediction
-from list3r.association.revisits.constellations.search import ThingSearch, ThingSearchSettings
+from list3r.association.revisits.constellations.instance_search import InstanceSearch, InstanceSearchSettings
 from list3r.association.revisits.cross_check import Side
-from list3r.association.revisits.cues import (
-    NO_CUES,
-    CueSettings,
-    InstanceCues,
+from list3r.association.revisits.frame_search import Candidate, SearchSettings, find_candidates, is_revisit
+from list3r.association.revisits.further_pairs import FurtherPairSettings, are_independent, similar_views
+from list3r.association.revisits.instance_similarity import (
+    NO_SIMILARITY,
     InstanceSet,
+    InstanceSimilarity,
+    SimilaritySettings,
     compare_instances,
     instance_set,
     loop_score,
 )
-from list3r.association.revisits.frame_search import Candidate, SearchSettings, find_candidates, is_revisit
 from list3r.association.revisits.joint_window import (
     JointReconstructor,
     Objection,
@@ -42,14 +49,7 @@ from list3r.association.revisits.joint_window import (
     no_edge,
 )
 from list3r.association.revisits.scaled_verification import verify_scaled
-from list3r.association.revisits.second_looks import SecondLookSettings, are_two, seeing_the_same
 from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.all_keyframes import (
-    WITNESSED,
-    AllKeyframesSettings,
-    contradicted,
-    place_by_all_keyframes,
-)
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge, Keyframe
@@ -72,37 +72,37 @@ class RevisitSettings:
     enough: int = 8
     """Accepted edges after which no further candidate of a chunk is verified."""
     second_opinions: int = 0
-    """Most joint windows of a chunk where keyframes with features and depth were compared in vain. For RGB-D they cost
+    """Most joint windows of a chunk for keyframes with features and depth that were rejected. For RGB-D they cost
     seconds each and find little more (redkitchen)."""
     of_networks: int = 3
-    """The same where a network makes the chunks: three passes over 40 frames are about what the chunk itself took, and
-    a network relates views that share too little for features (research/association 0151)."""
+    """The same where a network makes the chunks: three passes over 40 frames take about as long as the chunk itself,
+    and a network relates views that share too little for features (research/association 0151)."""
     most_ambiguous: float = 2.0
-    """Relations that agree on where a part of the video lies that nothing tied to the rest before, for each one that
-    says otherwise."""
+    """Least ratio of the relations that agree on the place of another component to those that contradict them, for
+    them to be accepted."""
     layout_pairs: int = 5
     """Instances that must agree on a layout for its scale to count."""
     most_scale_ratio: float = 1.6
     """Largest ratio of an edge's scale to that of the instances' layout."""
     search: SearchSettings = field(default_factory=SearchSettings)
-    cues: CueSettings = field(default_factory=CueSettings)
+    similarity: SimilaritySettings = field(default_factory=SimilaritySettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     chain: ChainSettings = field(default_factory=ChainSettings)
-    things: ThingSearchSettings = field(default_factory=ThingSearchSettings)
-    """Where frames that look alike do not suffice."""
-    second_looks: SecondLookSettings = field(default_factory=SecondLookSettings)
-    """Where a single relation ties a session to another."""
+    instances: InstanceSearchSettings = field(default_factory=InstanceSearchSettings)
+    """Used where similar frames do not suffice."""
+    further_pairs: FurtherPairSettings = field(default_factory=FurtherPairSettings)
+    """Used where a single relation joins two sessions."""
     all_keyframes: AllKeyframesSettings = field(default_factory=AllKeyframesSettings)
-    """Where frames that look alike do not place a session."""
+    """Used where similar frames do not place a session."""
 
 
 @dataclass(frozen=True)
 class ScoredCandidate:
-    """A candidate with what the instances of its two chunks say."""
+    """A candidate with the similarity of the instances of its two chunks."""
 
     candidate: Candidate
-    cues: InstanceCues
+    similarity: InstanceSimilarity
     score: float
     """s_loop."""
 
@@ -121,15 +121,15 @@ def find_loops(
     search = RevisitSearch(store, chunk_id, chosen)
     found = _by_frames(store, chunk_id, search, joint, chosen)
     edges = search.unambiguous(found)
-    if chosen.things.enabled and (by_things := search.by_things(edges)):
-        edges = search.unambiguous([*found, *by_things])  # things can also decide between places that frames propose
+    if chosen.instances.enabled and (by_instances := search.by_instances(edges)):
+        edges = search.unambiguous([*found, *by_instances])  # instances also decide between places of frames
     return edges
 
 
 def _by_frames(
     store: Store, chunk_id: int, search: RevisitSearch, joint: JointReconstructor | None, chosen: RevisitSettings
 ) -> list[Edge]:
-    """Find the loop edges between a chunk and those with frames that look like its own. The edges may contradict."""
+    """Find the loop edges between a chunk and those with similar frames. The edges may contradict each other."""
     candidates = find_candidates(store, chunk_id, chosen.search)
     edges: list[Edge] = []
     tried = 0
@@ -145,7 +145,7 @@ def _by_frames(
             tried += 1
         edges.append(with_scores(edge, scored))
     if (alone := search.alone(edges)) is not None:
-        edges += search.second_looks(alone, {e.frames for e in edges if e.u == alone.u})
+        edges += search.further_pairs(alone, {e.frames for e in edges if e.u == alone.u})
     return search.by_all_keyframes(edges) if chosen.all_keyframes.chunks else edges
 
 
@@ -154,8 +154,8 @@ def ranked(candidates: Sequence[Candidate], search: RevisitSearch, weight: float
     before any second one."""
     out = []
     for candidate in candidates:
-        cues = search.cues(candidate.u)
-        out.append(ScoredCandidate(candidate, cues, loop_score(candidate.s_det, cues, weight)))
+        similarity = search.similarity(candidate.u)
+        out.append(ScoredCandidate(candidate, similarity, loop_score(candidate.s_det, similarity, weight)))
     out.sort(key=lambda s: (-s.score, s.candidate.u, s.candidate.frame_u, s.candidate.frame_v))
     seen: list[int] = []
     turn = []
@@ -170,10 +170,10 @@ def with_scores(edge: Edge, scored: ScoredCandidate) -> Edge:
     scores = {
         "cosine": scored.candidate.cosine,
         "s_det": scored.candidate.s_det,
-        "s_sem": scored.cues.s_sem,
-        "s_rel": scored.cues.s_rel,
+        "s_sem": scored.similarity.s_sem,
+        "s_rel": scored.similarity.s_rel,
         "s_loop": scored.score,
-        "pairs": float(len(scored.cues.pairs)),
+        "pairs": float(len(scored.similarity.pairs)),
     }
     return replace(edge, scores=edge.scores | scores)
 
@@ -194,7 +194,7 @@ def _comparable(keyframe: Keyframe) -> bool:
 
 
 class InstanceSets(LruCache[int, tuple[object, InstanceSet]]):
-    """Instances of the chunks that were compared last, with what they were made of."""
+    """Instances of the chunks that were compared last, with a key of their inputs."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_BYTES, lambda held: held[1].feature.nbytes + held[1].center.nbytes)
@@ -209,31 +209,31 @@ class RevisitSearch:
         self._settings = settings
         self._rows = {c.chunk_id: c for c in store.chunks.all()}
         self._sides: dict[int, Side] = {}
-        self._cues: dict[int, InstanceCues] = {}
+        self._similarity: dict[int, InstanceSimilarity] = {}
         self._chains = EdgeChains(store.edges.all(), settings.chain)
         self._connected = self._chains.connected_to(chunk_id)
         self._second_opinions = settings.second_opinions
 
-    def cues(self, u: int) -> InstanceCues:
-        """Tell how the instances of a stored chunk agree with those of the new one."""
-        if u not in self._cues:
+    def similarity(self, u: int) -> InstanceSimilarity:
+        """Compare the instances of a stored chunk with those of the new one."""
+        if u not in self._similarity:
             here, there = self._instances(self._id), self._instances(u)
-            self._cues[u] = compare_instances(there, here, self._settings.cues)
-        return self._cues[u]
+            self._similarity[u] = compare_instances(there, here, self._settings.similarity)
+        return self._similarity[u]
 
     def _keyframes(self, c: Candidate) -> tuple[Keyframe, Keyframe]:
         return self._store.keyframes.get(c.u, c.frame_u), self._store.keyframes.get(self._id, c.frame_v)
 
-    def by_things(self, found: Sequence[Edge]) -> list[Edge]:
-        """Return loop edges by the chunks' things alone, to what frames did not join to the new chunk."""
+    def by_instances(self, found: Sequence[Edge]) -> list[Edge]:
+        """Return loop edges by the chunks' instances alone, to chunks that no frame joins to the new one."""
         joined = {k for e in found if e.accepted for k in self._chains.connected_to(e.u)}
         revisits = [k for k, row in self._rows.items() if is_revisit(self._rows[self._id], row, self._settings.search)]
         apart = [k for k in revisits if self._apart(k) and k not in joined]
         tied = [] if any(e.accepted for e in found) else [k for k in revisits if not self._apart(k)]
         if not apart and not tied:
             return []
-        things = ThingSearch(self._store, self._rows, self._id, self._side, self._settings.things)
-        return things.edges(apart, tied, self._chains, self._settings.chain.most_deviations)
+        by_instances = InstanceSearch(self._store, self._rows, self._id, self._side, self._settings.instances)
+        return by_instances.edges(apart, tied, self._chains, self._settings.chain.most_deviations)
 
     def refused(self, scored: ScoredCandidate, reason: str) -> Edge:
         """Return an edge that is kept only for the record."""
@@ -246,8 +246,8 @@ class RevisitSearch:
         chain = None if self._apart(c.u) else self._chains.predict(c.u, self._id, found)
         metric = u.scale_kind == v.scale_kind == "metric"
         later = u.session_id != v.session_id
-        known = metric and later  # its scale, and things may have been moved in between
-        objection = partial(self._objection, NO_CUES if known else scored.cues, chain)
+        known = metric and later  # its scale, and objects may have been moved in between
+        objection = partial(self._objection, NO_SIMILARITY if known else scored.similarity, chain)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
         if _comparable(keyframe_u) and _comparable(keyframe_v):
@@ -264,21 +264,21 @@ class RevisitSearch:
         return replace(edge, scores=edge.scores | off)
 
     def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
-        """Tell whether a single pair of frames is all that joins a chunk to the new one so far."""
+        """Return whether only a single pair of frames joins a chunk to the new one so far."""
         return self._apart(u) and len(accepted) == 1
 
     def alone(self, edges: Sequence[Edge]) -> Edge | None:
         """Return the accepted edge that joins the new chunk to another session, if no other edge supports it."""
         accepted = [e for e in edges if e.accepted]
         session = {k: row.session_id for k, row in self._rows.items()}
-        apart = self._settings.second_looks.apart
+        apart = self._settings.further_pairs.apart
         if any(e.frames is None or session[e.u] == session[self._id] or not self._apart(e.u) for e in accepted):
             return None
-        if any(are_two(e, f, session, apart) for e, f in itertools.combinations(accepted, 2)):
+        if any(are_independent(e, f, session, apart) for e, f in itertools.combinations(accepted, 2)):
             return None
         return max(accepted, key=lambda e: (e.confidence, -e.u), default=None)
 
-    def second_looks(self, edge: Edge, known: Container[tuple[int, int] | None]) -> list[Edge]:
+    def further_pairs(self, edge: Edge, known: Container[tuple[int, int] | None]) -> list[Edge]:
         """Return relations of further keyframes of two chunks, until one more is accepted (research/sessions 0056).
 
         The edge only decides which keyframes are compared: each pair is compared as if nothing were known.
@@ -286,8 +286,8 @@ class RevisitSearch:
         sides = self._side(edge.u).samples, self._side(self._id).samples
         u, v = (self._store.keyframes.descriptors([k])[0][:, 1].tolist() for k in (edge.u, self._id))
         out: list[Edge] = []
-        for frame_u, frame_v in seeing_the_same(edge, sides, (u, v), self._settings.second_looks):
-            scored = ScoredCandidate(Candidate(edge.u, frame_u, frame_v, 0.0, 0.0), NO_CUES, 0.0)
+        for frame_u, frame_v in similar_views(edge, sides, (u, v), self._settings.further_pairs):
+            scored = ScoredCandidate(Candidate(edge.u, frame_u, frame_v, 0.0, 0.0), NO_SIMILARITY, 0.0)
             if (frame_u, frame_v) not in known and all(map(_comparable, self._keyframes(scored.candidate))):
                 out.append(self.verified(scored, None, ()))
             if out and out[-1].accepted:
@@ -295,17 +295,17 @@ class RevisitSearch:
         return out
 
     def by_all_keyframes(self, edges: Sequence[Edge]) -> list[Edge]:
-        """Return the edges with those that all keyframes find to other sessions, where frames that look alike do not
-        place this one (research/sessions 0134). What they contradict is rejected, what they find again replaced."""
+        """Return the edges with those between all keyframes of this chunk and other sessions, where similar frames do
+        not place it (research/sessions 0134). Edges that they contradict are rejected, repeated ones replaced."""
         s, here, session = self._settings, self._rows[self._id], {k: r.session_id for k, r in self._rows.items()}
         others = [e for e in edges if session[e.u] != here.session_id and self._apart(e.u)]
-        alike = sorted(others, key=lambda e: (not e.accepted, -e.scores.get("s_det", 0.0), e.u))
-        metric = [e.u for e in alike if self._rows[e.u].scale_kind == here.scale_kind == "metric"]
-        sure = [e for e in alike if e.accepted and e.u in metric]
+        similar = sorted(others, key=lambda e: (not e.accepted, -e.scores.get("s_det", 0.0), e.u))
+        metric = [e.u for e in similar if self._rows[e.u].scale_kind == here.scale_kind == "metric"]
+        sure = [e for e in similar if e.accepted and e.u in metric]
         agree = [
             e
             for e, f in itertools.combinations(sure, 2)
-            if are_two(e, f, session, s.second_looks.apart) and self._agree(e, f)
+            if are_independent(e, f, session, s.further_pairs.apart) and self._agree(e, f)
         ]
         if agree and not contradicted(
             agree[0], self._comparable_keyframes(agree[0].u), self._comparable_keyframes(self._id), s.all_keyframes
@@ -328,10 +328,10 @@ class RevisitSearch:
         return [f for f in self._store.keyframes.of(chunk_id) if _comparable(f)]
 
     def _contradicted(self, edge: Edge, found: Sequence[Edge]) -> Edge:
-        """Return an edge, rejected if it disagrees with the place that the whole of both chunks supports."""
+        """Return an edge, rejected if it disagrees with the place that all keyframes of both chunks support."""
         if not edge.accepted or not found or self._agree(found[0], edge):
             return edge
-        return _rejected(edge, "the whole of both chunks contradicts it")
+        return _rejected(edge, "all keyframes of both chunks contradict it")
 
     def unambiguous(self, edges: Sequence[Edge]) -> list[Edge]:
         """Return the edges, with those rejected that join separate components in contradictory ways.
@@ -354,20 +354,20 @@ class RevisitSearch:
         return out
 
     def _agree(self, one: Edge, other: Edge) -> bool:
-        """Tell whether two relations of the new chunk can both be true; those to places apart from each other can."""
+        """Return whether two relations of the new chunk can both be true; to different components they always can."""
         chain = self._chains.predict(other.u, self._id, [one])
         return chain is None or chain.deviations(other.S_v_u) <= self._settings.chain.most_deviations
 
     def _apart(self, u: int) -> bool:
-        """Tell whether nothing joined a chunk to the new one before."""
+        """Return whether no edges joined a chunk to the new one before."""
         return u not in self._connected
 
-    def _objection(self, cues: InstanceCues, chain: Prediction | None, S_v_u: Sim3) -> str | None:
+    def _objection(self, similarity: InstanceSimilarity, chain: Prediction | None, S_v_u: Sim3) -> str | None:
         """Return how the chain of edges between the chunks or the layout of instances contradicts a relation."""
         if chain is not None and (off := chain.deviations(S_v_u)) > self._settings.chain.most_deviations:
             return f"the chain of edges between the chunks contradicts it by {off:.0f} deviations"
-        if len(cues.pairs) >= self._settings.layout_pairs and np.isfinite(cues.log_scale):
-            ratio = float(np.exp(abs(np.log(float(S_v_u.scale)) - cues.log_scale)))
+        if len(similarity.pairs) >= self._settings.layout_pairs and np.isfinite(similarity.log_scale):
+            ratio = float(np.exp(abs(np.log(float(S_v_u.scale)) - similarity.log_scale)))
             if ratio > self._settings.most_scale_ratio:
                 return f"its scale is {ratio:.1f} times off that of the instances' layout"
         return None
@@ -389,14 +389,14 @@ class RevisitSearch:
         return self._sides[chunk_id]
 
     def _instances(self, chunk_id: int) -> InstanceSet:
-        """Return the instances of a chunk, read once while the store is open: a place is compared again and again."""
+        """Return the instances of a chunk, cached while the store is open: a place is compared again and again."""
         store, kept = self._store, self._store.derived.of(InstanceSets)
-        key = (store.chunks.checksum(chunk_id), self._settings.cues)
+        key = (store.chunks.checksum(chunk_id), self._settings.similarity)
         held = kept.get(chunk_id)
         if held is None or held[0] != key:
             samples, nodes = store.chunks.samples(chunk_id), store.local_instances.nodes([chunk_id])
             space = store.chunks.feature_space(chunk_id)
-            held = kept.put(chunk_id, (key, instance_set(nodes, samples.T_chunk_cam, space, self._settings.cues)))
+            held = kept.put(chunk_id, (key, instance_set(nodes, samples.T_chunk_cam, space, self._settings.similarity)))
         return held[1]
 
     def _id_of(self, scored: ScoredCandidate) -> tuple[int, int]:

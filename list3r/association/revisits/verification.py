@@ -1,8 +1,8 @@
-"""Verify that two keyframes see the same place, and how they lie to each other.
+"""Verify that two keyframes see the same place, and measure their relation.
 
-Local features give a first pose; the small depth images refine it, held by those features where surfaces alone would
-slide; then each side is checked against the other: enough is seen by both, depth agrees, and neither sees through a
-surface of the other.
+Local features give a first pose; the small depth images refine it, with the features constraining directions in which
+surfaces alone would slide; then each side is checked against the other: overlap is sufficient, depth agrees, and
+neither sees through a surface of the other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from list3r.memory.records import Edge, Keyframe
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.local import FeaturePose, match, relative_pose
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.rgbd.registration import FrameRegistration, KnownFeatures, Samples, register
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, KnownFeatures, Samples, register
 from list3r.reconstruction.rgbd.settings import RegistrationSettings
 from list3r.reconstruction.rgbd.view import WorkingFrame, surface
 
@@ -28,7 +28,7 @@ Pose = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class VerificationSettings:
-    """When a revisit is believed."""
+    """When a revisit is accepted."""
 
     features: FeatureSettings = field(default_factory=FeatureSettings)
     least_feature_share: float = 0.15
@@ -38,7 +38,7 @@ class VerificationSettings:
             photometric_weight=0.0, gate_m=0.08, gate_halvings=1, iterations=20
         )
     )
-    """Features begin within some centimetres: a wider gate takes the wall for the picture that hung before it
+    """Features begin within some centimetres: a wider gate takes the wall for the picture that was in front of it
     (research/sessions 0058)."""
     scaled_registration: RegistrationSettings = field(
         default_factory=lambda: RegistrationSettings(photometric_weight=0.0, gate_m=0.15, iterations=20)
@@ -49,7 +49,7 @@ class VerificationSettings:
     least_agreement: float = 0.8
     """Least share of it that agrees rather than being seen through."""
     least_changed_agreement: float = 0.6
-    """The same of two sessions where the other side sees nothing else: something large is gone, or came."""
+    """The same of two sessions where the other side agrees: something large was removed or added."""
     one_sided: float = 0.95
     """Agreement of that other side."""
     most_residual: float = 3.0
@@ -57,9 +57,9 @@ class VerificationSettings:
     residual_scale_m: float = 0.03
     """Residual at which a point counts 1/e in the edge's confidence (sigma_r), metres."""
     least_depth_m: float = 0.1
-    """Depth from which a point lies before a camera."""
+    """Least depth of a point in front of a camera."""
     seen_through_m: float = 0.03
-    """A point is seen through where depth lies further behind it than this and"""
+    """A point is seen through where depth is farther behind it than this and"""
     seen_through_sigmas: float = 3.0
     """this many deviations of the sensor's noise."""
     scale_gate: float = 1.5
@@ -78,11 +78,11 @@ class _Side:
 
 @dataclass(frozen=True)
 class _Check:
-    """How the surface of one side fares in the other's depth image."""
+    """Comparison of the surface of one side with the other's depth image."""
 
     overlap: float
     agreement: float
-    """Of the points seen: not hidden, agreeing against agreeing or seen through."""
+    """Of the points that are not hidden: agreeing against agreeing or seen through."""
     closeness: float
     """Mean of exp(-r / sigma_r) over points that are not hidden."""
     residual_m: float
@@ -99,7 +99,7 @@ def verify(
 ) -> Edge:
     """Return the loop edge between two chunks by one keyframe of each, accepted or rejected with the reason.
 
-    `later`: they are of two sessions, between which something may have been put there or taken away.
+    `later`: they are of two sessions, between which objects may have been added or removed.
     """
     chosen = settings or VerificationSettings()
     build = _EdgeBuilder(keyframe_u, keyframe_v, u_id, v_id)
@@ -148,7 +148,7 @@ def _refine(
     b: NDArray[np.float32],
     settings: VerificationSettings,
 ) -> FrameRegistration | None:
-    """Return T_u_v from depth and the features that agree, in the camera coordinates of u."""
+    """Return T_u_v from depth and the inlier features, in the camera coordinates of u."""
     T = pose.T_a_b
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     a, b = a[known], b[known]

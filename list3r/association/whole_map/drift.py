@@ -1,4 +1,4 @@
-"""Drift spread over the frames of a map by the revisits among them: a graph of similarities, one a frame."""
+"""Spread a map's drift over its frames by the accepted revisits: a graph of similarities, one per frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 def spread_drift(
     views: Sequence[MapView], revisits: Sequence[Revisit], settings: DriftSettings
 ) -> tuple[dict[int, Array], list[Revisit]]:
-    """T_map_cam of the views by their keys, the first where it was, and the revisits that are believed."""
+    """Return T_map_cam of the views by key, the first unchanged, and the accepted revisits."""
     count, steps = len(views), len(views) - 1
     poses = stack([Sim3.from_matrix(v.T_map_cam) for v in views])
     relations = [Sim3.from_matrix(np.linalg.inv(b.T_map_cam) @ a.T_map_cam) for a, b in pairwise(views)]

@@ -1,6 +1,5 @@
-"""Maps of parts of one video joined where they see the same: a camera that turns on the spot carries no scale along,
-and what is mapped falls apart there.
-"""
+"""Join maps of parts of one video where they overlap: a camera that rotates in place passes no scale on, and the map
+breaks there."""
 
 from __future__ import annotations
 
@@ -23,12 +22,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Side:
-    """A map, and what each of its keyframes sees of it."""
+    """A map, and the points that each of its keyframes sees."""
 
     found: SparseMap
     points_cam: dict[int, Array]
-    """All corners and features of a keyframe in its camera coordinates, NaN where the map does not hold them, by key.
-    Shape (N, 3)."""
+    """All corners and features of a keyframe in its camera coordinates, NaN where the map has none, by key. Shape
+    (N, 3)."""
 
 
 def join_maps(
@@ -39,7 +38,7 @@ def join_maps(
     settings: tuple[JoiningSettings, RevisitPairSettings],
 ) -> SparseMap:
     """Return the largest map with those that can be joined to it, one after another; they may share keyframes."""
-    looks = {k: describe_rooted(f.descriptors) for k, f in features.items()}
+    descriptors = {k: describe_rooted(f.descriptors) for k, f in features.items()}
     left = list(maps[1:])
     whole = maps[0]
     joined = True
@@ -50,7 +49,7 @@ def join_maps(
                 left.remove(other)
                 continue
             a, b = _side(whole, problem), _side(other, problem)
-            pairs = _candidates(list(a.points_cam), list(b.points_cam), looks, settings[0])
+            pairs = _candidates(list(a.points_cam), list(b.points_cam), descriptors, settings[0])
             S = _relation_of_maps(a, b, [_rows(p, problem, features) for p in pairs], problem, camera, settings)
             if S is not None:
                 whole, joined = _merged(whole, other, S), True
@@ -63,7 +62,7 @@ def _side(found: SparseMap, problem: MapProblem) -> _Side:
 
 
 def seen_points(found: SparseMap, view: KeyframeView, key: int) -> Array:
-    """All that a keyframe sees, in its camera coordinates, NaN where the map does not hold it. Shape (N, 3)."""
+    """All that a keyframe sees, in its camera coordinates, NaN where the map has no point. Shape (N, 3)."""
     T, held = found.T_map_cam[key], set(found.seen[key].ids.tolist())
     nowhere = np.full(3, np.nan)
     places = np.array([found.points[n] if n in held else nowhere for n in view.ids.tolist()]).reshape(-1, 3)
@@ -71,10 +70,10 @@ def seen_points(found: SparseMap, view: KeyframeView, key: int) -> Array:
 
 
 def _candidates(
-    a: Sequence[int], b: Sequence[int], looks: Mapping[int, NDArray[np.float32]], how: JoiningSettings
+    a: Sequence[int], b: Sequence[int], descriptors: Mapping[int, NDArray[np.float32]], how: JoiningSettings
 ) -> list[tuple[int, int]]:
-    """Keyframes of the two maps, by key, that may see the same; a keyframe that both hold sees what it sees."""
-    cosine = np.stack([looks[n] for n in b]) @ np.stack([looks[m] for m in a]).T
+    """Keyframes of the two maps, by key, that may overlap; one that both maps hold is paired with itself."""
+    cosine = np.stack([descriptors[n] for n in b]) @ np.stack([descriptors[m] for m in a]).T
     place = {key: k for k, key in enumerate(sorted({*a, *b}))}
     out: set[tuple[int, int]] = set()
     for row, n in zip(cosine, b, strict=True):
@@ -88,7 +87,7 @@ class _Pair:
     a: int
     b: int
     rows: NDArray[np.int64]
-    """Rows of the two keyframes that show the same. Shape (M, 2)."""
+    """Matching rows of the two keyframes. Shape (M, 2)."""
 
 
 def _rows(pair: tuple[int, int], problem: MapProblem, features: Mapping[int, LocalFeatures]) -> _Pair:
@@ -120,7 +119,7 @@ def _relation_of_maps(
         measured = relation(
             a.points_cam[pair.a][at_a], problem.views[pair.b].xy[at_b], points_b[at_b], camera, settings[1]
         )
-        if measured is not None and measured.tells_scale:
+        if measured is not None and measured.least_scale_points:
             T_a, T_b = (Sim3.from_matrix(m.found.T_map_cam[k]) for m, k in ((a, pair.a), (b, pair.b)))
             found.append((T_a @ measured.S_b_a.inverse() @ T_b.inverse(), T_b, float(np.nanmedian(points_b[:, 2]))))
     votes = [sum(_agree(S, other, T_b, depth, how) for other, _, _ in found) for S, T_b, depth in found]
@@ -133,7 +132,7 @@ def _relation_of_maps(
 
 
 def _agree(one: Sim3, other: Sim3, T_b: Sim3, depth: float, how: JoiningSettings) -> bool:
-    """Tell whether two relations S_a_b put a view of b, which sees so deep, at the same place."""
+    """Return whether two relations S_a_b place a view of b, at a typical depth, equally."""
     off = ((one @ T_b).inverse() @ other @ T_b).log()
     near = np.linalg.norm(off[:3]) < how.shift * depth and np.linalg.norm(off[3:6]) < how.turn_rad
     return bool(near and abs(off[6]) < how.log_scale)

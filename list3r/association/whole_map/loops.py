@@ -1,4 +1,4 @@
-"""What the map of a whole video saw again, as loops between its chunks."""
+"""Revisits of the map of a whole video, as loops between its chunks."""
 
 from __future__ import annotations
 

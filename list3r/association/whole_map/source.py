@@ -15,7 +15,7 @@ from list3r.reconstruction.sfm.settings import SfmSettings
 
 
 def takes_wide_steps(source: FrameSource, settings: VideoMapSettings, pace: PaceSettings) -> bool:
-    """Tell whether a video is short enough and moves in steps as wide as is mapped as a whole."""
+    """Return whether a video is short and its steps are wide enough to be mapped as a whole."""
     if not settings.least_frames <= source.info.frame_count <= settings.most_frames:
         return False
     flows = picture_flows(source, pace)
@@ -25,7 +25,7 @@ def takes_wide_steps(source: FrameSource, settings: VideoMapSettings, pace: Pace
 def map_source(source: FrameSource, sfm: SfmSettings, settings: VideoMapSettings) -> VideoMap | None:
     """Return the map of a video whose camera is known, by Frame.index; None where it gives none.
 
-    It is kept nowhere but in the chunks' poses: the same video and camera give the same map again.
+    It is stored only in the chunks' poses: the same video and camera give the same map again.
     """
     camera = source.info.camera
     assert camera is not None, "the camera is estimated before"

@@ -1,7 +1,7 @@
 """One map of a whole video of wide steps, before its chunks (research/colour-video 0074).
 
-Frames are followed and matched with those ahead, and mapped in one go; then frames that see the same again are sought,
-drift is spread over the way between them, and all is adjusted together.
+Frames are tracked and matched with those ahead, and mapped in one go; then revisits are searched, drift is spread
+between them, and all is adjusted together.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.association.whole_map.views import view_of
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.adjustment import adjust
-from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.frame_poses import PosedSegment, pose_segments
 from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps, shared_rows
@@ -35,15 +35,15 @@ _IDS = 1_000_000
 
 @dataclass(frozen=True)
 class VideoMap:
-    """Where the camera was in a whole video, in one frame of reference and scale."""
+    """The camera poses of a whole video, in one frame of reference and scale."""
 
     T_map_cam: dict[int, Array]
     """By position of the frame. Shape (4, 4) each."""
     revisits: list[tuple[int, int, int]]
-    """Positions of frames that see again what was out of sight between them, the earlier first, and by how many
-    features."""
+    """Positions of frames that see again a place that was out of sight between them, the earlier first, and the number
+    of features."""
     keyframes: tuple[MapProblem, SparseMap]
-    """Some of the keyframes that it stands on, with their points."""
+    """Some of the map's keyframes, with their points."""
 
 
 def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings: VideoMapSettings) -> VideoMap | None:
@@ -61,21 +61,21 @@ def map_video(grays: Sequence[Gray], camera: Camera, sfm: SfmSettings, settings:
     if len(joined.T_map_cam) < settings.least_posed * len(tracks.keyframes):
         return None
     found, revisits = _closed(joined, problem, features, camera, settings)
-    segments = fill_segments([found], tracks, grays, sfm.fill, adjusted=True)
+    segments = pose_segments([found], tracks, grays, sfm.fill, adjusted=True)
     if not segments or len(segments[0].T_map_cam) < settings.least_posed * len(grays):
         return None
     return VideoMap(_scaled(segments[0]), revisits, _some_keyframes(found, problem))
 
 
 def _some_keyframes(found: SparseMap, problem: MapProblem) -> tuple[MapProblem, SparseMap]:
-    """Return every third keyframe of a map: enough to tell the camera by."""
+    """Return every third keyframe of a map: enough to estimate the camera."""
     kept = sorted(found.T_map_cam)[::3]
     some = replace(found, T_map_cam={k: found.T_map_cam[k] for k in kept}, seen={k: found.seen[k] for k in kept})
     return MapProblem({k: problem.views[k] for k in kept}, {}), some
 
 
 def _scaled(segment: PosedSegment) -> dict[int, Array]:
-    """Poses by position, in a scale in which the middle of all depths is where chunks have it."""
+    """Poses by position, scaled to the chunks' usual median depth."""
     depths = np.concatenate([segment.depths(k)[1] for k in sorted(segment.seen)])
     scale = MIDDLE_DEPTH / float(np.median(depths)) if len(depths) else 1.0
     lengths = np.ones((4, 4))
@@ -118,7 +118,7 @@ def _closed(
     camera: Camera,
     settings: VideoMapSettings,
 ) -> tuple[SparseMap, list[tuple[int, int, int]]]:
-    """Return the map adjusted, with what is seen again closed, and the revisits."""
+    """Return the map adjusted, with its revisits closed, and the revisits."""
     views = [view_of(k, found, features[k], _first_id(k)) for k in sorted(found.T_map_cam)]
     revisits, common = find_revisits(views, camera, settings.revisits)
     T_map_cam, believed = spread_drift(views, revisits, settings.drift) if revisits else (found.T_map_cam, [])

@@ -1,4 +1,4 @@
-"""Frames of a map with their features, and which of them may see the same."""
+"""Frames of a map with their features, and which of them may overlap."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class MapView:
     T_map_cam: Array
     """Shape (4, 4)."""
     features: LocalFeatures
-    look: NDArray[np.float32]
+    descriptor: NDArray[np.float32]
     """Unit descriptor of the whole frame. Shape (D,)."""
     points_cam: Array
-    """Features in camera coordinates, map units, NaN where the map does not hold them. Shape (N, 3)."""
+    """Features in camera coordinates, map units, NaN where the map has no point. Shape (N, 3)."""
     seen_cam: Array
     """All points of the map that it sees, by features or corners, in camera coordinates. Shape (M, 3)."""
 
     @property
     def depth(self) -> float:
-        """Median depth of what it sees, map units; 1 where it sees nothing."""
+        """Median depth of the points that it sees, map units; 1 without any."""
         return float(np.median(self.seen_cam[:, 2])) if len(self.seen_cam) else 1.0
 
 
@@ -50,10 +50,10 @@ def view_of(key: int, found: SparseMap, features: LocalFeatures, first_id: int) 
 
 
 def shared_views(views: Sequence[MapView], camera: Camera, sample: int = 48, margin: float = 0.15) -> Array:
-    """Return the share of what each view sees that lies in the picture of each other one, the lesser of both
-    directions. Shape (V, V).
+    """Return the share of each view's points inside the picture of each other one, the lesser of both directions.
+    Shape (V, V).
 
-    The `margin` of the picture on every side does not count, since poses have drifted; what is behind a wall does.
+    The `margin` of the picture on every side does not count, since poses have drifted; points behind a wall do.
     """
     share = np.zeros((len(views), len(views)))
     T = np.linalg.inv(np.stack([v.T_map_cam for v in views]))

@@ -33,7 +33,7 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction, Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
-from list3r.reconstruction.keyframe_record import FrameLook, KeyframeNetworks, frame_samples, make_keyframes
+from list3r.reconstruction.keyframe_record import FrameDescriptor, KeyframeNetworks, frame_samples, make_keyframes
 from list3r.reconstruction.registry import ModelOptions, entry, import_model, make_reconstructor
 
 
@@ -366,7 +366,7 @@ def _instance_models(settings: BuildSettings) -> tuple[Discoverer, Tracker]:
     )
 
 
-def _frame_look(settings: BuildSettings) -> FrameLook | None:
+def _frame_look(settings: BuildSettings) -> FrameDescriptor | None:
     """What describes whole frames; None for the VLAD of their SIFT features."""
     if settings.frame_look == "local":
         return None

@@ -20,7 +20,7 @@ from list3r.reconstruction.features.learned import LEARNED_WIDTH, LearnedFeature
 DIVISOR = 32
 """Sides of the network's input are multiples of this."""
 RADIUS = 2
-"""Only the best score within so many pixels is a keypoint."""
+"""Only the best score within this many pixels is a keypoint."""
 MIN_SCORE = 0.1
 TEMPERATURE = 0.1
 """Of the soft-argmax that places a keypoint between pixels (the paper's)."""
@@ -41,7 +41,7 @@ class Aliked:
         self._device = torch.device(device)
 
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
-        """Return the `count` surest features of a picture (H, W, 3), the surest first."""
+        """Return the `count` most confident features of a picture (H, W, 3), best first."""
         height, width = color.shape[:2]
         with torch.inference_mode():
             picture = torch.from_numpy(np.ascontiguousarray(color)).to(self._device).permute(2, 0, 1)[None].float()
@@ -99,7 +99,7 @@ class _Block(nn.Module):
 
 
 class _Descriptor(nn.Module):
-    """The sparse deformable head: each keypoint looks where its own neighbourhood says."""
+    """The sparse deformable head: each keypoint samples at offsets predicted from its own neighbourhood."""
 
     def __init__(self, width: int, positions: int, patch: int) -> None:
         super().__init__()
@@ -173,7 +173,7 @@ class _Network(nn.Module):
 
 
 def _network_of(state: dict[str, Tensor], weights: Path) -> _Network:
-    """Return the network whose sizes the weights tell."""
+    """Return the network with the sizes of the weights."""
     try:
         one, two = (state[f"block{k}.conv2.weight"].shape[0] for k in (1, 2))
         three, four = (state[f"block{k}.conv2.regular_conv.weight"].shape[0] for k in (3, 4))

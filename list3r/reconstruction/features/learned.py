@@ -1,4 +1,4 @@
-"""Learned local features: what a network gives, and how descriptors are stored as bytes."""
+"""Learned local features: a network's output, and how descriptors are stored as bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEARNED_WIDTH = 256
 
 @dataclass(frozen=True)
 class LearnedFeatures:
-    """Local features of one picture, N of them, the surest first."""
+    """Local features of one picture, N of them, best first."""
 
     xy: NDArray[np.float32]
     """px. Shape (N, 2)."""
@@ -28,15 +28,15 @@ class LearnedDetector(Protocol):
     """A network that detects and describes."""
 
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
-        """Return the `count` surest features of a picture (H, W, 3)."""
+        """Return the `count` most confident features of a picture (H, W, 3)."""
         ...
 
 
 def as_bytes(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return unit descriptors (N, D) as bytes (N, 256) whose square roots, made unit, have about the same products.
 
-    Positive and negative parts are kept apart and squared, so that what stores and matches RootSIFT serves these too;
-    the rest is zeros.
+    Positive and negative parts are kept apart and squared, so that storing and matching are those of RootSIFT; the rest
+    is zeros.
     """
     halves = np.concatenate([np.maximum(descriptors, 0.0), np.maximum(-descriptors, 0.0)], axis=1) ** 2
     halves *= 255.0 / np.maximum(halves.max(axis=1, keepdims=True, initial=0.0), 1e-12)

@@ -1,4 +1,4 @@
-"""Local features with depth: what finds a frame again without a guess of its pose."""
+"""Local features with depth, which relocalise a frame without an initial pose."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: Fe
 
 
 def shrinkage(shape: tuple[int, ...], width: int) -> float:
-    """Return the factor by which a picture (h, w) is shrunk so that its longer side is `width` px at the most."""
+    """Return the factor by which a picture (h, w) is shrunk to a longer side of at most `width` px."""
     return min(1.0, width / max(shape))
 
 
 def shrunk(gray: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Return a picture shrunk by a factor. A place x of it is (x + 0.5) / factor - 0.5 of the picture."""
+    """Return a picture shrunk by a factor. Its point x is at (x + 0.5) / factor - 0.5 of the picture."""
     if factor == 1.0:
         return gray
     size = (round(gray.shape[1] * factor), round(gray.shape[0] * factor))
@@ -89,8 +89,8 @@ def points_at(xy: Floats, depth: Floats, camera: Camera) -> Floats:
 def match(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float) -> NDArray[np.int64]:
     """Mutual nearest neighbours that pass the ratio test, by RootSIFT distance. Shape (M, 2).
 
-    Descriptors of another width than SIFT's are learned ones (`learned.as_bytes`), whose distances lie closer together;
-    kinds of different widths have nothing in common.
+    Descriptors of another width than SIFT's are learned ones (`learned.as_bytes`), whose distances vary less; different
+    widths never match.
     """
     if len(a) < 2 or len(b) < 2 or a.shape[1] != b.shape[1]:
         return np.zeros((0, 2), np.int64)
@@ -118,7 +118,7 @@ def relative_pose(
     settings: FeatureSettings,
     noise: SensorNoise,
 ) -> FeaturePose | None:
-    """Return the rigid transform most pairs of 3D points agree on, by seeded RANSAC; None when too few do.
+    """Return the rigid transform that most pairs of 3D points agree on, by seeded RANSAC; None for too few inliers.
 
     `points_a` and `points_b` have shape (M, 3), camera coordinates, metres; pairs with an unknown point are left out.
     """

@@ -10,7 +10,7 @@ class FeatureSettings:
     """How local features are found, matched and verified."""
 
     width: int = 0
-    """Pictures are shrunk to at most this many px on their longer side; 0 for as they are."""
+    """Pictures are shrunk to at most this many px on their longer side; 0 keeps their size."""
     count: int = 400
     """Most features on a frame."""
     contrast: float = 0.015

@@ -2,7 +2,7 @@
 into a compact image representation", 2010, with the normalisation within each word of Arandjelovic, Zisserman, "All
 about VLAD", 2013).
 
-The vocabulary lies beside this file and was learned on simulated rooms, so that a chunk's descriptors depend on that
+The vocabulary is in this folder and was learned on simulated rooms, so that a chunk's descriptors depend on that
 chunk alone, and frames of different videos can be compared (research/association 0061).
 """
 

@@ -1,8 +1,8 @@
 """Reconstruction by a feed-forward network: many frames in, poses, depth and confidence of all of them out.
 
-What the adapters of this room share: pictures as the network's own loader makes them, the device, as many
-frames at once as the memory holds, and one form of the answer. An adapter is a `Network`: its card, where its class is,
-and how its outputs read in the terms of `WindowOutput`.
+Shared by all adapters: pictures as the network's own loader makes them, the device, as many frames at once as the
+memory holds, and one form of the output. An adapter is a `Network`: its card, its class, and how its outputs become a
+`WindowOutput`.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ if TYPE_CHECKING:
     import torch
 
 Answer = Callable[[Any, "torch.Tensor", "torch.Tensor | None"], WindowOutput]
-"""Poses, depth, confidence and focal lengths that a model tells of pictures (n, 3, h, w) in [0, 1]. The last argument
-are known intrinsics of the pictures, px, (n, 3, 3), pixel centres at whole numbers, for models that take them."""
+"""Poses, depth, confidence and focal lengths that a model predicts for pictures (n, 3, h, w) in [0, 1]. The last
+argument are known intrinsics, px, (n, 3, 3), pixel centres at whole numbers, for models that take them."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """What an adapter is."""
+    """The definition of an adapter."""
 
     name: str
     """Of its card."""
     module: str
     class_name: str
-    """Where the upstream package has its class."""
+    """Of its class in the upstream package."""
     loader: Loader
-    """How its pictures are made of frames."""
+    """How frames become its pictures."""
     answer: Answer
     load_class: Callable[[Any, Path, torch.device], Any] = load_upstream
     """Makes the class with the weights at a path; an adapter wraps it where the package needs more care."""
@@ -57,7 +57,7 @@ class Network:
 
     @property
     def card(self) -> ModelCard:
-        """What the network is."""
+        """The network's card."""
         card = find_card(self.name, "geometry")
         assert card is not None
         return card
@@ -98,11 +98,11 @@ class FeedforwardReconstructor:
     def joint(self, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
         """Reconstruct frames of several places, each with a camera of its own, in one pass and one gauge.
 
-        A joint window is never split: where it does not fit into the memory all sides are thinned out alike. Raises
+        A joint window is never split: where it does not fit into the memory all sides are subsampled alike. Raises
         `TrackingError` when a side cannot be posed, or when too few frames would be left.
         """
         first = self._network.loader.place(sides[0].camera.height, sides[0].camera.width)
-        placements = [first, *(self._beside(first, side.camera) for side in sides[1:])]
+        placements = [first, *(self._place_among(first, side.camera) for side in sides[1:])]
         budget = self._ready(first)
         while True:
             count = sum(len(side.frames) for side in sides)
@@ -118,8 +118,8 @@ class FeedforwardReconstructor:
                 raise TrackingError(f"{count} frames of several places do not fit into the memory at once")
             sides = [replace(side, frames=side.frames[::2]) for side in sides]
 
-    def _beside(self, first: Placement, camera: Camera) -> Placement:
-        """Where frames of another camera lie in pictures of the size of the first ones."""
+    def _place_among(self, first: Placement, camera: Camera) -> Placement:
+        """Where frames of another camera are in pictures of the size of the first ones."""
         own = self._network.loader.place(camera.height, camera.width)
         return own if own.size == first.size else fitted(camera, first.size)
 
@@ -147,7 +147,7 @@ class FeedforwardReconstructor:
         return self._budget
 
     def _pass(self, sides: Sequence[WindowSide], placements: Sequence[Placement]) -> list[WindowOutput]:
-        """One pass through the network over the frames of all sides; the answer for each side's whole frames."""
+        """One pass through the network over the frames of all sides; the output for each side's whole frames."""
         both = list(zip(sides, placements, strict=True))
         resample = self._network.loader.resample
         seen = [pictures([f.color for f in side.frames], p, resample) for side, p in both]
@@ -159,7 +159,7 @@ class FeedforwardReconstructor:
         return [whole_frames(output.part(slice(*span)), p) for span, p in zip(spans, placements, strict=True)]
 
     def _answer(self, seen: NDArray[np.uint8], K: NDArray[np.float64] | None) -> WindowOutput:
-        """Ask the network, in half precision on a GPU, and note how much memory it took."""
+        """Run the network, in half precision on a GPU, and record its memory use."""
         import torch
 
         device, cuda = self._device, self._device.type == "cuda"
@@ -174,7 +174,7 @@ class FeedforwardReconstructor:
             torch.inference_mode(),
             torch.autocast(device.type, half_precision(device), enabled=cuda and self._network.half),
         ):
-            torch.manual_seed(0)  # some networks draw samples; a chunk's answer depends on nothing but the chunk
+            torch.manual_seed(0)  # some networks draw samples; a chunk's output depends on nothing but the chunk
             output = self._network.answer(self._model, stack, known)
         if cuda and self._budget is not None:
             self._budget.measured(len(seen), torch.cuda.max_memory_allocated(device) / 2**20, weights_mb)

@@ -1,4 +1,4 @@
-"""What a feed-forward network says of some frames, in the same terms for all of them, and what a chunk makes of it."""
+"""The output of any feed-forward network for some frames, in common terms, and a chunk's reconstruction from it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.feedforward.pictures import Placement
 from list3r.reconstruction.feedforward.settings import NetworkSettings
 from list3r.reconstruction.poses import select_keyframes
-from list3r.reconstruction.rgbd.confidence import beside_edge
+from list3r.reconstruction.rgbd.confidence import next_to_edge
 
 LEAST_CONFIDENCE = 0.05
-"""Depth that the network believes in less than this is unknown (what the authors of pi3 keep in their odometry)."""
+"""Depth of less confidence than this is unknown (the threshold of pi3's authors in their odometry)."""
 LEAST_FOCAL, MOST_FOCAL = 0.2, 10.0
-"""Focal lengths by the picture's longer side that a lens can have; what lies outside is no camera."""
+"""Possible focal lengths of a lens, by the picture's longer side; others are invalid."""
 
 
 @dataclass(frozen=True)
 class WindowOutput:
-    """A network's answer for n frames, at its own picture size h x w, in its own gauge and units."""
+    """A network's output for n frames, at its own picture size h x w, in its own gauge and units."""
 
     T_window_cam: NDArray[np.float64]
     """Pose of each camera, OpenCV axes. Shape (n, 4, 4)."""
@@ -57,7 +57,7 @@ class WindowOutput:
         return np.asarray(finite & rigid & lens & (self.known().any(axis=(1, 2))))
 
     def known(self) -> NDArray[np.bool_]:
-        """Pixels whose depth is finite, positive, and believed in. Shape (n, h, w)."""
+        """Pixels whose depth is finite, positive, and confident enough. Shape (n, h, w)."""
         sane = np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.confidence)
         return np.asarray(sane & (self.confidence >= LEAST_CONFIDENCE))
 
@@ -69,7 +69,7 @@ def middles(depth: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def whole_frames(output: WindowOutput, placement: Placement) -> WindowOutput:
-    """Return the answer for whole frames of a network that saw them cut or filled; unknown where they were cut."""
+    """Return the output for whole frames of a network that saw them cropped or padded; unknown where cropped."""
     return replace(
         output,
         depth=placement.whole(output.depth),
@@ -88,10 +88,10 @@ def to_reconstruction(
 ) -> Reconstruction:
     """A chunk's reconstruction at the frames' own size, in the frame of its first posed camera; scale is relative.
 
-    `camera` says the frames' size and, where it is `known`, the rays of their pixels; else they are the median of
-    what the network found. Depth is that of the points on those rays that are nearest to the network's own. `noise`
-    says how rough depth is that is no network's, whose edges are not smeared. Raises `TrackingError` when the network
-    has an answer for fewer than two frames.
+    `camera` gives the frames' size and, where it is `known`, the rays of their pixels; otherwise the rays are by the
+    medians of the network's intrinsics. Depth is that of the points on these rays nearest to the network's own. `noise`
+    is that of depth from another source than a network, with sharp edges. Raises `TrackingError` when the network gives
+    valid poses for fewer than two frames.
     """
     chosen = settings or NetworkSettings()
     posed = output.valid()
@@ -126,7 +126,7 @@ def to_reconstruction(
 
 
 def network_camera(camera: Camera, output: WindowOutput, posed: NDArray[np.bool_]) -> Camera:
-    """Return the camera of the frames with the medians of what the network found, px of the frames."""
+    """Return the camera of the frames with the medians of the network's intrinsics, px of the frames."""
     height, width = output.depth.shape[1:]
     K = np.median(np.concatenate([output.focal, output.principal], axis=1)[posed], axis=0)
     fx, fy, cx, cy = (float(v) for v in K)
@@ -152,16 +152,16 @@ def _on_rays(output: WindowOutput, camera: Camera) -> NDArray[np.float32]:
 def _enlarged(
     one: WindowOutput, camera: Camera, smeared: NetworkSettings | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
-    """Return depth and confidence of one frame at the frames' size; unknown where a neighbour of a pixel is.
+    """Return depth and confidence of one frame at the frames' size; unknown where a neighbour of a pixel is unknown.
 
-    `smeared` is given where depth runs from one surface into the next.
+    `smeared` marks pixels where depth interpolates between two surfaces.
     """
     size = (camera.width, camera.height)
     known = one.known()[0]
     depth = np.where(known, one.depth[0], np.float32(0))
     confidence = np.where(known, np.clip(one.confidence[0], 0.0, 1.0), np.float32(0)).astype(np.float32)
     if smeared is not None:
-        confidence[beside_edge(depth, known, smeared.edge_step)] *= np.float32(smeared.edge_confidence)
+        confidence[next_to_edge(depth, known, smeared.edge_step)] *= np.float32(smeared.edge_confidence)
     large = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.999
     out = np.where(large, cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR), np.float32(0))
     sure = np.where(large, cv2.resize(confidence, size, interpolation=cv2.INTER_LINEAR), 0.0)
@@ -169,10 +169,10 @@ def _enlarged(
 
 
 def with_given_poses(made: Reconstruction, frames: Sequence[Frame]) -> Reconstruction:
-    """The reconstruction moved to the poses that the source gave, its depth brought to their scale (then metric).
+    """The reconstruction moved to the source's given poses, its depth scaled to them (then metric).
 
-    The scale is the ratio of how far the cameras stand from their middle. Raises `TrackingError` when fewer than two
-    frames have a valid pose, or when they do not move, which leaves the scale open.
+    The scale is the ratio of the cameras' distances from their centre. Raises `TrackingError` when fewer than two
+    frames have a valid pose, or when the cameras do not move, which leaves the scale undetermined.
     """
     given = [f.T_source_cam for f in frames]
     posed = made.posed & np.array([g is not None and bool(np.isfinite(g).all()) for g in given])
@@ -184,7 +184,7 @@ def with_given_poses(made: Reconstruction, frames: Sequence[Frame]) -> Reconstru
     away, true = (np.linalg.norm(c - c.mean(axis=0), axis=1) for c in (ours, theirs))
     reach = float(np.median(made.depth[posed][made.depth[posed] > 0]))
     if float(away.max()) < 1e-3 * reach:
-        raise TrackingError(f"the camera stands still in frames {frames[0].index} to {frames[-1].index}: no scale")
+        raise TrackingError(f"the camera does not move in frames {frames[0].index} to {frames[-1].index}: no scale")
     scale = float((away * true).sum() / (away * away).sum())
     return replace(
         made,

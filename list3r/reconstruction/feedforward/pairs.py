@@ -1,7 +1,7 @@
-"""Pictures of a chunk from pairs of them: each pair in the camera of its first picture, at a scale of its own.
+"""Poses and depth of a chunk's pictures from pairs: each pair in the camera of its first picture, at its own scale.
 
-A picture's points are the mean of what the pairs say in which it is the first, brought to one scale. The second picture
-of a pair gives the similarity from its own points to the first one's camera. Scales, rotations and translations of all
+A picture's points are the mean over the pairs in which it is the first, brought to one scale. The second picture of a
+pair gives the similarity from its own points to the first one's camera. Scales, rotations and translations of all
 pictures then follow by least squares, one after the other, over all pairs; pairs that disagree lose weight.
 """
 
@@ -22,12 +22,12 @@ _TURN = np.radians(2.0)
 _SHIFT = 0.05
 """Disagreement of a pair, in radians and in depths of its picture, at which it counts half."""
 _LEAST = 0.05
-"""Less sure points do not count."""
+"""Least confidence of a point that counts."""
 
 
 @dataclass(frozen=True)
 class PairPoints:
-    """What a network says of two pictures."""
+    """A network's output for two pictures."""
 
     first: int
     second: int
@@ -38,7 +38,7 @@ class PairPoints:
 
 
 def pair_plan(count: int) -> NDArray[np.int64]:
-    """Return the pairs of pictures that lie 1, 2, 4, ... apart, both ways round. Shape (P, 2).
+    """Return the pairs of pictures that are 1, 2, 4, ... apart, in both orders. Shape (P, 2).
 
     The widest are up to half of all apart, so that both places of a joint window are paired.
     """
@@ -48,7 +48,7 @@ def pair_plan(count: int) -> NDArray[np.int64]:
 
 
 def join_pairs(pairs: Sequence[PairPoints], count: int) -> WindowOutput:
-    """Return the answer for `count` pictures; those that no pair holds have no pose."""
+    """Return the output for `count` pictures; those in no pair have no pose."""
     points, confidence, scale_of = _own_points(pairs, count)
     edges = [e for p in pairs if (e := _edge(p, points, confidence, scale_of)) is not None]
     log_scale, R, t = _synchronised(edges, count)
@@ -98,7 +98,7 @@ def _own_points(
 def _edge(
     pair: PairPoints, points: NDArray[np.float32], confidence: NDArray[np.float32], scale_of: dict[int, float]
 ) -> _Edge | None:
-    """Return how the second picture's points lie in the first one's, None where too little is sure."""
+    """Return the similarity from the second picture's points to the first one's, None where too few are confident."""
     a = pair.points[1].reshape(-1, 3).astype(np.float64) * scale_of[id(pair)]
     b = points[pair.second].reshape(-1, 3).astype(np.float64)
     w = np.sqrt(pair.confidence[1].astype(np.float64) * confidence[pair.second]).ravel()
@@ -128,10 +128,10 @@ def _similarity(a: Array, b: Array, w: Array) -> tuple[float, Array, Array]:
 
 
 def _synchronised(edges: Sequence[_Edge], count: int) -> tuple[Array, Array, Array]:
-    """Return log scales (n,), rotations (n, 3, 3) and translations (n, 3) of pictures in the frame of the best tied.
+    """Return log scales (n,), rotations (n, 3, 3) and translations (n, 3) of pictures in the best connected one.
 
     x_world = e^s R x_picture + t, so that of an edge s_b = s_a + s_ab, R_b = R_a R_ab, t_b = t_a + e^s_a R_a t_ab. NaN
-    translations where nothing ties a picture.
+    translations for pictures without an edge.
     """
     reached = _reached(edges, count)
     used = [e for e in edges if e.first in reached and e.second in reached]
@@ -158,7 +158,7 @@ def _synchronised(edges: Sequence[_Edge], count: int) -> tuple[Array, Array, Arr
 
 
 def _reached(edges: Sequence[_Edge], count: int) -> set[int]:
-    """Return the largest set of pictures that edges tie."""
+    """Return the largest connected component of pictures."""
     group = list(range(count))
     for e in edges:
         one, two = group[e.first], group[e.second]

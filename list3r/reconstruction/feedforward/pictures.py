@@ -1,4 +1,4 @@
-"""How a frame becomes a network's picture, as each network's own loader does it, and where the picture lies in it."""
+"""How a frame becomes a network's picture, as in each network's own loader, and the frame's placement in it."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Resample = Callable[[Picture, int, int], Picture]
 
 @dataclass(frozen=True)
 class Placement:
-    """A frame scaled to `inner` and then cut or filled to `size`; both are height and width, px."""
+    """A frame scaled to `inner` and then cropped or padded to `size`; both are height and width, px."""
 
     inner: tuple[int, int]
     size: tuple[int, int]
     top: int = 0
     left: int = 0
-    """Row and column of the picture at which the scaled frame begins; below zero where it is cut."""
+    """Row and column of the picture at which the scaled frame begins; below zero where it is cropped."""
 
     def camera_matrix(self, camera: Camera) -> NDArray[np.float64]:
         """Return the intrinsic matrix of the picture, pixel centres at whole numbers, px. Shape (3, 3)."""
@@ -39,7 +39,7 @@ class Placement:
         return K
 
     def whole(self, maps: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Maps of the picture (n, h, w) as maps of the scaled frame, 0 where it was cut. Shape (n, *inner)."""
+        """Maps of the picture (n, h, w) as maps of the scaled frame, 0 where it was cropped. Shape (n, *inner)."""
         if self.inner == self.size:
             return maps
         out = np.zeros((len(maps), *self.inner), maps.dtype)
@@ -48,7 +48,7 @@ class Placement:
         return out
 
     def picture(self, scaled: Picture) -> Picture:
-        """Cut a scaled frame, or fill it up with white. Shape (*size, 3)."""
+        """Crop a scaled frame, or pad it with white. Shape (*size, 3)."""
         if self.inner == self.size:
             return scaled
         out = np.full((*self.size, 3), 255, np.uint8)
@@ -57,7 +57,7 @@ class Placement:
         return out
 
     def _spans(self) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Return the rows and columns of the picture that show the frame, and those of the frame that it shows."""
+        """Return the rows and columns of the picture that show the frame, and the corresponding ones of the frame."""
         inside, outside = [], []
         for first, full, has in zip((self.top, self.left), self.inner, self.size, strict=True):
             start, stop = max(first, 0), min(first + full, has)
@@ -67,10 +67,10 @@ class Placement:
 
 
 class Loader(Protocol):
-    """What a network's own loader does to a picture."""
+    """The preprocessing of a network's own loader."""
 
     def place(self, height: int, width: int) -> Placement:
-        """Return where the picture of a frame of a size lies."""
+        """Return the placement of a frame of a size in its picture."""
         ...
 
     @property
@@ -80,7 +80,7 @@ class Loader(Protocol):
 
 
 def pictures(colors: Sequence[Picture], placement: Placement, resample: Resample) -> Picture:
-    """Frames (H, W, 3) as a network sees them. Shape (n, *size, 3)."""
+    """Return the pictures that a network sees of frames (H, W, 3). Shape (n, *size, 3)."""
     return np.stack([placement.picture(resample(c, *placement.inner)) for c in colors])
 
 
@@ -131,20 +131,20 @@ class PictureSize:
         return max(1, rows) * PATCH, max(1, columns) * PATCH
 
     def place(self, height: int, width: int) -> Placement:
-        """Return where the picture of a frame of a size lies."""
+        """Return the placement of a frame of a size in its picture."""
         size = self.of(height, width)
         return Placement(size, size)
 
 
 @dataclass(frozen=True)
 class PaddedSize:
-    """The longer side of one length; what is taller than wide is filled up to a square with white (VGGT, "pad")."""
+    """The longer side of one length; pictures taller than wide are padded to a square with white (VGGT, "pad")."""
 
     longest: int
     resample: Resample = BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return where the picture of a frame of a size lies."""
+        """Return the placement of a frame of a size in its picture."""
         short = max(1, round(min(height, width) * self.longest / max(height, width) / PATCH)) * PATCH
         if width >= height:
             return Placement((short, self.longest), (short, self.longest))
@@ -153,13 +153,13 @@ class PaddedSize:
 
 @dataclass(frozen=True)
 class WidthSize:
-    """One width; the middle of what would be higher than wide (VGGT, "crop", which its own programs use)."""
+    """One width; pictures taller than wide are cropped to their middle (VGGT, "crop", used by its own programs)."""
 
     width: int
     resample: Resample = BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return where the picture of a frame of a size lies."""
+        """Return the placement of a frame of a size in its picture."""
         inner = max(1, round(height * self.width / width / PATCH)) * PATCH, self.width
         shown = min(inner[0], self.width)
         return Placement(inner, (shown, self.width), -((inner[0] - shown) // 2))
@@ -174,7 +174,7 @@ class CutSize:
     resample: Resample = LANCZOS_OR_BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return where the picture of a frame of a size lies."""
+        """Return the placement of a frame of a size in its picture."""
         scale = self.longest / max(height, width)
         inner = round(height * scale), round(width * scale)
         rows, columns = (max(1, 2 * (side // 2) // self.patch) * self.patch for side in inner)
@@ -189,11 +189,11 @@ class TabledSize:
     """The size of a table whose shape is nearest, covered by the frame, whose middle it shows (MapAnything)."""
 
     shapes: tuple[tuple[float, int, int], ...]
-    """Width by height, and the width and height that stand for it, px."""
+    """Width by height, and the corresponding width and height, px."""
     resample: Resample = LANCZOS_OR_BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return where the picture of a frame of a size lies."""
+        """Return the placement of a frame of a size in its picture."""
         _, columns, rows = min(self.shapes, key=lambda shape: abs(shape[0] - width / height))
         scale = max(columns / width, rows / height) + 1e-8
         inner = math.floor(height * scale), math.floor(width * scale)
@@ -201,7 +201,7 @@ class TabledSize:
 
 
 def fitted(camera: Camera, size: tuple[int, int]) -> Placement:
-    """Where frames of a camera lie in the middle of pictures of a size that is not their own, filled up with white."""
+    """The placement of frames of a camera in the middle of pictures of another size, padded with white."""
     scale = min(size[0] / camera.height, size[1] / camera.width)
     inner = min(size[0], round(camera.height * scale)), min(size[1], round(camera.width * scale))
     return Placement(inner, size, (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2)

@@ -1,4 +1,4 @@
-"""What networks that answer with a point for every pixel share: pinholes and poses that explain their points."""
+"""Pinholes and poses that fit the points of networks that predict a point for every pixel."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def views(pictures: torch.Tensor) -> list[dict[str, Any]]:
 
 
 def pinhole(points_cam: Points, weights: NDArray[np.float32]) -> Array:
-    """Return the pinhole (fx, fy, cx, cy), px, by which points in camera coordinates are seen at their pixels.
+    """Return the pinhole (fx, fy, cx, cy), px, that best projects points in camera coordinates to their pixels.
 
     A point (x, y, z) at column u obeys u = fx x / z + cx, a line in x / z fitted by least squares; rows obey the same
     of y. Points (h, w, 3), weights (h, w); NaN where nothing determines it.
@@ -54,10 +54,10 @@ def pinhole(points_cam: Points, weights: NDArray[np.float32]) -> Array:
 
 
 def from_points(T_window_cam: Array, points_cam: Points, confidence: NDArray[np.float32]) -> WindowOutput:
-    """Return the answer of a network that gives each pixel a point in its own camera (n, h, w, 3).
+    """Return the output of a network that gives each pixel a point in its own camera (n, h, w, 3).
 
-    Every picture gets the pinhole that explains its points best, and depth is that of the points on its rays that are
-    nearest to the network's, whose rays need not be those of a pinhole.
+    Every picture gets the pinhole that fits its points best, and the depth of the points on its rays nearest to the
+    network's points, whose rays need not be those of a pinhole.
     """
     K = np.stack([pinhole(p, c) for p, c in zip(points_cam, confidence, strict=True)])
     depth = np.stack([_depth_on_rays(p, k) for p, k in zip(points_cam, K, strict=True)])
@@ -75,7 +75,7 @@ def _depth_on_rays(points_cam: Points, K: Array) -> NDArray[np.float32]:
 def camera_of(points: Points, weights: NDArray[np.float32], K: Array) -> Array:
     """Return T_points_cam (4, 4) of the camera that sees every point (h, w, 3) at its pixel; NaN where none does.
 
-    The surest points decide, by RANSAC and then by least squares over those that agree.
+    The most confident points decide, by RANSAC and then by least squares over the inliers.
     """
     T = np.full((4, 4), np.nan)
     rows, columns = np.nonzero(np.isfinite(points).all(axis=-1) & (weights > 0))
@@ -93,7 +93,7 @@ def camera_of(points: Points, weights: NDArray[np.float32], K: Array) -> Array:
         if not found or agree is None or len(agree) < 6:
             return T
         turn, shift = cv2.solvePnPRefineLM(at[agree[:, 0]], px[agree[:, 0]], matrix, None, turn, shift)
-    except cv2.error:  # points that lie on one line, or at one place
+    except cv2.error:  # points that are on one line, or at one place
         return T
     R = cv2.Rodrigues(turn)[0]
     T = np.eye(4)

@@ -17,14 +17,14 @@ from list3r.reconstruction.feedforward.output import WindowOutput
 LEAST_WINDOW = 4
 """Shorter windows share too few frames to be joined; a machine on which four do not fit is refused."""
 SHARED = 0.3
-"""Share of a window that lies in the next one too (the paper's 30 of 100)."""
+"""Share of a window that is in the next one too (the paper's 30 of 100)."""
 
 Pass = Callable[[int, int], WindowOutput]
-"""The network's answer for the frames at positions [start, stop)."""
+"""The network's output for the frames at positions [start, stop)."""
 
 
 def run_windows(count: int, budget: MemoryBudget, run: Pass) -> WindowOutput:
-    """The answer for `count` frames: in one pass if they fit, else in windows that overlap, joined into one gauge.
+    """The output for `count` frames: in one pass if they fit, else in windows that overlap, joined into one gauge.
 
     When memory runs out the windows are halved and the pass is made again. Raises `OptionError` when not even
     `LEAST_WINDOW` frames fit.
@@ -54,8 +54,8 @@ def run_windows(count: int, budget: MemoryBudget, run: Pass) -> WindowOutput:
 def join(before: WindowOutput, after: WindowOutput, shared: int) -> WindowOutput:
     """Two windows as one, in the gauge of the first; its last `shared` frames are the first of the second.
 
-    The first half of the shared frames is taken from the first window, the second half from the second, whose middle
-    they are nearer to.
+    The first half of the shared frames is taken from the first window, the second half from the second, to whose middle
+    they are nearer.
     """
     S = between(before.part(slice(len(before.depth) - shared, None)), after.part(slice(0, shared)))
     keep = len(before.depth) - shared // 2
@@ -64,7 +64,7 @@ def join(before: WindowOutput, after: WindowOutput, shared: int) -> WindowOutput
 
 
 def regauged(output: WindowOutput, S: Sim3) -> WindowOutput:
-    """Return an answer in another gauge, S from its own."""
+    """Return an output in another gauge, S from its own."""
     T = output.T_window_cam.copy()
     T[:, :3, :3] = S.rotation @ T[:, :3, :3]
     T[:, :3, 3] = S.apply(output.T_window_cam[:, :3, 3])
@@ -74,7 +74,7 @@ def regauged(output: WindowOutput, S: Sim3) -> WindowOutput:
 def between(a: WindowOutput, b: WindowOutput) -> Sim3:
     """S_a_b from the same frames seen in two windows: scale by their depth, rotation and translation by their poses.
 
-    The scale is the median ratio of depth over pixels that both believe in, which needs no motion. Raises
+    The scale is the median ratio of depth over pixels confident in both, which needs no motion. Raises
     `DegenerateError` when the windows have no valid frame in common.
     """
     valid = a.valid() & b.valid()
@@ -91,7 +91,7 @@ def between(a: WindowOutput, b: WindowOutput) -> Sim3:
 
 
 def release() -> None:
-    """Give memory that a failed pass left behind back to the device."""
+    """Return memory that a failed pass left behind to the device."""
     import torch
 
     gc.collect()

@@ -1,9 +1,9 @@
-"""Find movers in free space: surfaces that were in one place for a part of a chunk only, for another frame saw through.
+"""Find movers in free space: surfaces that were in one place for a part of a chunk only, as other frames see through.
 
-A point that frame i sees, and behind whose place frame j reads a surface, was not there at j. Frames spread evenly over
-the chunk are asked, so that a thing that is carried away is found in the frames before it moved as well. It needs poses
-and depth alone, so given poses and estimated ones are served alike; what the odometry left out as moving of its own is
-taken as a hint, for the middle of a thing that sways is never seen through.
+A point of frame i that frame j sees through, to a surface behind, was not there at j. Frames spread evenly over the
+chunk are compared, so that an object that is taken away is also found in the frames before it moved. This needs poses
+and depth alone, so given and estimated poses are served alike; the movers of the odometry are hints, because the middle
+of an object that sways is never seen through.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class SmallFrames:
     posed: Mask
     """Shape (F,)."""
     stride: int
-    """Which pixel of the whole image each pixel is: the n-th."""
+    """Subsampling of the whole image: every n-th pixel."""
 
     @staticmethod
     def of(
         depths: Sequence[Floats | None], T_chunk_cam: NDArray[np.float64], posed: Mask, camera: Camera, width: int
     ) -> SmallFrames:
-        """Thin out the depth images; those without depth are not posed."""
+        """Subsample the depth images; those without depth are not posed."""
         stride = max(1, round(camera.width / width))
         small = camera.every(stride)
         depth = np.zeros((len(depths), small.height, small.width), np.float32)
@@ -55,9 +55,9 @@ class SmallFrames:
 def movers_in_free_space(
     frames: SmallFrames, hints: Mapping[int, Mask] | None = None, settings: FreeSpaceMoverSettings | None = None
 ) -> NDArray[np.bool_] | None:
-    """Return what moves in each frame, at the size of the small frames; None where nothing does. Shape (F, h, w).
+    """Return the movers of each frame, at the size of the small frames; None without any. Shape (F, h, w).
 
-    `hints` are masks of any size by position: what the odometry found to move of its own.
+    `hints` are masks of any size by position: the movers of the odometry.
     """
     s, hints = settings or FreeSpaceMoverSettings(), hints or {}
     ask = _References(frames, s)
@@ -76,12 +76,12 @@ def movers_in_free_space(
     for order in (posed, posed[::-1]):
         for before, position in itertools.pairwise(order):
             if out[before].any():
-                out[position] |= ask.carried_on(position, out[before] & ~out[position], frames.depth[before])
+                out[position] |= ask.continued(position, out[before] & ~out[position], frames.depth[before])
     return out if out.any() else None
 
 
 class _References:
-    """The frames that are asked whether they saw through something."""
+    """The frames in which seeing through is tested."""
 
     def __init__(self, frames: SmallFrames, settings: FreeSpaceMoverSettings) -> None:
         self._frames, self._s = frames, settings
@@ -94,13 +94,13 @@ class _References:
         self._T_cam_chunk = {p: np.linalg.inv(frames.T_chunk_cam[p]) for p in self._positions}
 
     def anything(self, position: int) -> bool:
-        """Return whether a coarse look finds something that was seen through."""
+        """Return whether a coarse test finds anything that was seen through."""
         through, _ = self._ask(position, 2)
         solid = cv2.morphologyEx(through.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         return bool(solid.sum() >= self._s.least_share * through.size)
 
     def moving(self, position: int, hint: Mask | None) -> Mask:
-        """What moves in a frame: surfaces, or what of them was not seen to stay, of which enough was seen through."""
+        """Movers of a frame: surfaces, or their parts not seen to stay, of which enough was seen through."""
         s, depth = self._s, self._frames.depth[position]
         through, stays = self._ask(position, 1)
         whole = _whole(depth, s)
@@ -113,10 +113,9 @@ class _References:
             return out
         return np.asarray(cv2.morphologyEx(out.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0)
 
-    def carried_on(self, position: int, before: Mask, depth_before: Floats) -> Mask:
-        """What of a frame goes on with what moved in the frame beside it: surfaces that lie on it mostly, as far away,
-        so that a thing that stands still for a while is not lost.
-        """
+    def continued(self, position: int, before: Mask, depth_before: Floats) -> Mask:
+        """Movers of a frame that continue those of an adjacent frame: surfaces that mostly overlap it at equal depth,
+        so that an object that is static for a while is not lost."""
         s, depth = self._s, self._frames.depth[position]
         out = np.zeros(depth.shape, bool)
         if before.sum() < s.least_share * before.size:
@@ -130,19 +129,19 @@ class _References:
                 np.bincount(labels.ravel(), image.ravel(), minlength=count) for image in (through, stays, near)
             )
             area = stats[:, cv2.CC_STAT_AREA]
-            good = (gone >= s.hinted * (gone + kept)) & (held >= s.carried * area)
+            good = (gone >= s.hinted * (gone + kept)) & (held >= s.continued * area)
             if region is whole:
-                good |= held >= s.surely_carried * area
+                good |= held >= s.surely_continued * area
             good &= area >= s.least_share * region.size
             good[0] = False
             out |= good[labels]
         return out
 
     def _ask(self, position: int, step: int) -> tuple[Mask, Mask]:
-        """Return which pixels were seen through, and which were seen to stay. Shapes (h, w), thinned out by `step`.
+        """Return which pixels were seen through, and which were seen to stay. Shapes (h, w), subsampled by `step`.
 
-        Going away from the frame in time, what was seen through and is there again later was never seen through: so
-        a surface that reads badly, or a pose that is wrong, is not taken for a thing that came or went.
+        Pixels that are seen through and later, farther from the frame in time, seen again were never seen through: so
+        bad readings and wrong poses are not taken for objects that came or went.
         """
         if step == 1 and position in self._known:
             return self._known[position]
@@ -155,7 +154,7 @@ class _References:
         votes, asked = np.zeros(len(known), np.int8), np.zeros(len(known), np.int8)
         for side in (-1, 1):
             gone = np.zeros(len(known), bool)
-            for other in self._beside(position, side):
+            for other in self._references_after(position, side):
                 behind, same, seen = self._compare(points, position, other)
                 back |= gone & same
                 gone |= behind
@@ -169,12 +168,12 @@ class _References:
             self._known[position] = found
         return found
 
-    def _beside(self, position: int, side: int) -> list[int]:
+    def _references_after(self, position: int, side: int) -> list[int]:
         near = [p for p in self._positions if side * (p - position) > 0]
         return near if side > 0 else near[::-1]
 
     def _compare(self, points: Floats, position: int, other: int) -> tuple[Mask, Mask, Mask]:
-        """For points of a frame in its camera: whether another frame reads a surface behind them, the same one, any."""
+        """Compare points of a frame, in its camera, with another's depth: surface behind them, the same one, any."""
         s, camera = self._s, self._frames.camera
         T = self._T_cam_chunk[other] @ self._frames.T_chunk_cam[position]
         p = points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
@@ -194,7 +193,7 @@ class _References:
 
 
 def _disagreement(apart: Floats, z: Floats, s: FreeSpaceMoverSettings) -> float:
-    """Return by how much two frames disagree about what stands still, metres beyond noise: the error of their poses."""
+    """Return the disagreement of two frames on static surfaces, metres beyond noise: the error of their poses."""
     few = slice(None, None, max(1, len(apart) // 1000))
     near = np.abs(apart[few]) < s.near_share * z[few]
     if near.sum() < 20:
@@ -203,9 +202,8 @@ def _disagreement(apart: Floats, z: Floats, s: FreeSpaceMoverSettings) -> float:
 
 
 def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, s: FreeSpaceMoverSettings) -> Mask:
-    """The connected parts of a region of which a part of what was compared was seen through, and that do not lie in the
-    midst of a surface that stays.
-    """
+    """The connected parts of a region of which a share of the compared pixels was seen through, and that are not
+    embedded in a static surface."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
     area, least = stats[:, cv2.CC_STAT_AREA], s.least_share * region.size
     gone = np.bincount(labels.ravel(), through.ravel(), minlength=count)
@@ -226,7 +224,7 @@ def _chosen(region: Mask, whole: Mask, through: Mask, stays: Mask, part: float, 
 
 
 def _whole(depth: Floats, s: FreeSpaceMoverSettings) -> Mask:
-    """Pixels that no step of depth parts from their neighbours."""
+    """Pixels without a depth step to their neighbours."""
     limit = np.float32(s.edge_share) * depth + 3 * s.noise.sigma(depth)
     whole = depth > 0
     across, down = np.abs(np.diff(depth, axis=1)) > limit[:, 1:], np.abs(np.diff(depth, axis=0)) > limit[1:]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from list3r.compiled import compiled
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.motion.settings import ResidualMoverSettings
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, PosePrior, Samples, register, steps_without
 from list3r.reconstruction.rgbd.kernels import centred
-from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register, steps_without
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
@@ -29,7 +29,7 @@ class Fit:
     """How well a pose explains model points inside and outside a mask."""
 
     inside: float
-    """Mean truncated cost, 0 to 2 * truncate^2; NaN for none."""
+    """Mean truncated cost, 0 to 2 * truncate^2; NaN without pixels."""
     outside: float
     count_inside: int
     count_outside: int
@@ -61,7 +61,7 @@ def _split(cost: Floats, moving: Mask) -> Fit:
 def pixel_costs(
     model: Samples, view: WorkingFrame, T_model_cam: Pose, settings: ResidualMoverSettings, noise: SensorNoise
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Truncated squares of depth and brightness residuals in units of noise, summed, and the pixels they fall on."""
+    """Truncated squares of depth and brightness residuals over noise, summed, and their pixels."""
     camera = view.camera
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     law = noise.constant_m, noise.quadratic_per_m, noise.nearest_m
@@ -83,7 +83,7 @@ def _residuals(
     view: tuple[Floats, Floats, Mask],
     law: tuple[float, float, float],
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Distances of a view's surface from model points over noise, differences of brightness, and pixels, (M,) each."""
+    """Distances of a view's surface from model points over noise, brightness differences, and pixels, (M,) each."""
     points, normals, gray = model
     there, tone, valid = view
     R, t = T_model_cam[:3, :3], T_model_cam[:3, 3]
@@ -118,7 +118,7 @@ def _residuals(
 
 
 def surfaces(view: WorkingFrame, settings: ResidualMoverSettings, noise: SensorNoise) -> list[Mask]:
-    """Masks of the surfaces that are parted from their surroundings by steps of depth, largest first."""
+    """Masks of the surfaces bounded by steps of depth, largest first."""
     depth, area = view.depth, view.depth.size
     step = np.float32(settings.depth_step) * depth + 3 * noise.sigma(depth)
     whole = depth > 0
@@ -149,9 +149,9 @@ def mover_in_residuals(
     odometry: OdometrySettings,
     prior: PosePrior | None = None,
 ) -> tuple[Mask, FrameRegistration] | None:
-    """Return the surface that moves of its own most plainly, and the view registered without it; None without one.
+    """Return the surface that most plainly moves, and the view registered without it; None without one.
 
-    A `prior` that held the view holds what is left of it as well: a bare wall alone would let the camera slide.
+    A `prior` of the view's pose also applies to the rest of it: a bare wall alone would let the camera slide.
     """
     registration, settings, noise = odometry.registration, odometry.movers, odometry.noise
     best: tuple[float, Mask] | None = None
@@ -202,18 +202,18 @@ def suspects(model: Samples, view: WorkingFrame, found: FrameRegistration, odome
 
 
 class MoverMemory:
-    """What moved in the last frame, carried to the next until it has stood still."""
+    """Movers of the last frame, propagated to the next until they have been static."""
 
     def __init__(self, settings: ResidualMoverSettings, noise: SensorNoise) -> None:
         self._settings, self._noise = settings, noise
         self.mask: Mask | None = None
-        """What moves in the last frame that was followed."""
+        """Movers of the last tracked frame."""
         self._trial: Samples | None = None
         self._trial_age = 0
         self._home = -1
 
     def expect(self, view: WorkingFrame) -> Mask | None:
-        """Return what of the next view still belongs to the mover."""
+        """Return the part of the next view that still belongs to the mover."""
         if self.mask is None or not self.mask.any():
             return None
         out = np.zeros_like(self.mask)
@@ -225,9 +225,9 @@ class MoverMemory:
         return out
 
     def keep(self, view: WorkingFrame, mask: Mask, T_model_cam: Pose, usual: float, home: int) -> Mask:
-        """Remember what moves in a followed view (the whole one); returns it, or nothing once it has stood still.
+        """Remember the movers of a tracked view (the whole one); returns them, or nothing once they were static.
 
-        `usual` is the mean cost of what does not move, `home` the number of the segment whose coordinates are meant.
+        `usual` is the mean cost of the static part, `home` the number of the segment of the coordinates.
         """
         if home != self._home:
             self._trial, self._home = None, home

@@ -1,4 +1,4 @@
-"""Track movers from frame to frame by place, size and colour, and drop those that went nowhere."""
+"""Track movers from frame to frame by position, size and colour, and drop those that went nowhere."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Blob:
     rgb: Array
     """Mean colour. Shape (3,)."""
     thickness: float
-    """How far its surface reaches back along a row of the picture, median over rows: what is seen of its depth."""
+    """Visible depth of its surface along a row of the picture, median over rows."""
 
 
 @dataclass
@@ -42,7 +42,7 @@ class MoverTrack:
 
     blobs: list[Blob] = field(default_factory=list)
     places: list[Array] = field(default_factory=list)
-    """Middles of the blobs, chunk coordinates."""
+    """Centres of the blobs, chunk coordinates."""
 
 
 def track_movers(
@@ -52,9 +52,9 @@ def track_movers(
     frames: SmallFrames,
     settings: MoverTrackSettings | None = None,
 ) -> NDArray[np.uint8] | None:
-    """Return the number of the mover at each pixel, from 1, 0 for what stays; None without any. Shape (F, h, w).
+    """Return the number of the mover at each pixel, from 1, 0 for static ones; None without any. Shape (F, h, w).
 
-    `masks` (F, h, w) hold what may move; a blob that is seen in too few frames, or that goes nowhere, is left out.
+    `masks` (F, h, w) mark candidates; a blob that is seen in too few frames, or that goes nowhere, is left out.
     `colors` are the frames' pictures at any size, RGB.
     """
     s = settings or MoverTrackSettings()
@@ -74,10 +74,10 @@ def track_movers(
 
 
 def middles(blobs: Sequence[Blob], T_chunk_cam: Array) -> Array:
-    """Middle of each blob in the chunk, with what the border of the picture cut off added. Shape (V, 3).
+    """Centre of each blob in the chunk, including the part outside of the picture. Shape (V, 3).
 
     Of a blob that is cut on one side the other side is known, and the full width and height from frames that saw it
-    whole (or most of it). The back of a thing is hidden: it is taken to be at least half as deep as it is wide.
+    whole (or most of it). The back of an object is hidden: it is assumed to be at least half as deep as it is wide.
     """
     extent = np.array([b.high - b.low for b in blobs])
     cut = np.array([b.cut for b in blobs])
@@ -165,7 +165,7 @@ def _place(blob: Blob, frames: SmallFrames) -> Array:
 def _assign(
     tracks: list[MoverTrack], blobs: Sequence[Blob], times_s: Array, frames: SmallFrames, s: MoverTrackSettings
 ) -> None:
-    """Give each blob to the track that expects it nearest, best pairs first; what is left begins a track."""
+    """Assign each blob to the track that expects it nearest, best pairs first; the rest begin tracks."""
     pairs = []
     for n, blob in enumerate(blobs):
         place = _place(blob, frames)
@@ -192,7 +192,7 @@ def _assign(
 
 
 def _together(tracks: list[MoverTrack], s: MoverTrackSettings) -> list[MoverTrack]:
-    """Tracks that keep beside each other in most frames of the shorter one are parts of one thing and its track."""
+    """Merge tracks that are next to each other in most frames of the shorter one: parts of one object."""
     out: list[MoverTrack] = []
     for track in sorted(tracks, key=lambda t: (-len(t.blobs), t.blobs[0].position)):
         if not any(_took_in(whole, track, s) for whole in out):
@@ -201,11 +201,11 @@ def _together(tracks: list[MoverTrack], s: MoverTrackSettings) -> list[MoverTrac
 
 
 def _took_in(whole: MoverTrack, track: MoverTrack, s: MoverTrackSettings) -> bool:
-    """Add a track to one beside which it keeps; whether it does."""
+    """Merge a track into one that it is next to; returns whether it was."""
     by_frame = {b.position: n for n, b in enumerate(whole.blobs)}
     shared = [(b, by_frame[b.position]) for b in track.blobs if b.position in by_frame]
-    beside = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
-    if not shared or len(shared) < s.together * len(track.blobs) or len(beside) < s.together * len(shared):
+    near = [b for b, n in shared if _gap(b, whole.blobs[n]) < 2 * s.gap_m]
+    if not shared or len(shared) < s.together * len(track.blobs) or len(near) < s.together * len(shared):
         return False
     for blob, n in shared:
         whole.blobs[n] = _union(whole.blobs[n], blob)
@@ -227,7 +227,7 @@ def _union(a: Blob, b: Blob) -> Blob:
 
 
 def _expected(track: MoverTrack, position: int, times_s: Array) -> Array:
-    """Return where a track goes on to: half of its last speed, for things turn and stop."""
+    """Return the predicted position of a track: at half of its last velocity, because objects turn and stop."""
     if len(track.places) < 2:
         return track.places[-1]
     a, b = track.blobs[-2].position, track.blobs[-1].position
@@ -236,7 +236,7 @@ def _expected(track: MoverTrack, position: int, times_s: Array) -> Array:
 
 
 def _went(track: MoverTrack, frames: SmallFrames, s: MoverTrackSettings) -> bool:
-    """Whether two of its places lie apart: by a part of its width, so that no change of view makes it seem so."""
+    """Whether two of its positions are apart: by a part of its width, so that no change of view can cause it."""
     places = middles(track.blobs, frames.T_chunk_cam)
     if len(places) > 3:
         places = np.asarray(cv2.blur(places, (1, 3), borderType=cv2.BORDER_REPLICATE), np.float64)

@@ -1,4 +1,4 @@
-"""Flat regions without texture, filled with the plane of their rim where that is one, and said to be unsure."""
+"""Fill flat regions without texture with the plane of their rim, if that is one, at low confidence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.mvs.settings import RegionFillSettings
-from list3r.reconstruction.ranks import medians
+from list3r.reconstruction.order_statistics import medians
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -18,7 +18,7 @@ def fill_regions(
 ) -> tuple[Floats, Floats]:
     """Inverse depth and sigma (h, w) with flat regions filled. `color` is RGB of the same size, shape (h, w, 3).
 
-    Inverse depth of a plane is linear in the pixel's place, so three pixels of the rim make a hypothesis.
+    Inverse depth of a plane is linear in the pixel's position, so three pixels of the rim make a hypothesis.
     """
     labels, count = _regions(inverse > 0, color, settings)
     inverse, sigma = inverse.copy(), sigma.copy()
@@ -37,7 +37,7 @@ def fill_regions(
 def _regions(
     known: Mask, color: NDArray[np.uint8], settings: RegionFillSettings
 ) -> tuple[NDArray[np.int32], list[tuple[int, tuple[slice, slice]]]]:
-    """Numbered regions without depth, parted at edges of colour; each with a box that holds its rim too."""
+    """Numbered regions without depth, separated at edges of colour; each with a box that includes its rim."""
     gray = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32)
     dx = np.abs(cv2.filter2D(gray, -1, np.array([[-1.0, 0.0, 1.0]], np.float32))).max(axis=2)
     dy = np.abs(cv2.filter2D(gray, -1, np.array([[-1.0], [0.0], [1.0]], np.float32))).max(axis=2)
@@ -89,7 +89,7 @@ def _plane_of_rim(
 def _best_plane(
     places: NDArray[np.float64], w: NDArray[np.float64], settings: RegionFillSettings
 ) -> NDArray[np.float64] | None:
-    """Return the plane through three pixels of the rim that most of it agrees with."""
+    """Return the plane through three pixels of the rim with most inliers among the rim."""
     rng = np.random.default_rng(len(w))
     few = rng.choice(len(w), min(300, len(w)), replace=False)
     picks = rng.integers(0, len(w), (settings.hypotheses, 3))

@@ -1,4 +1,4 @@
-"""Depth of several keyframes held against one another, fused, filled, and carried to every frame."""
+"""Depth of several keyframes checked against each other, fused, filled, and projected into every frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from list3r.reconstruction.mvs.kernels import enlarged, fill_holes, splat
 from list3r.reconstruction.mvs.settings import DepthFusionSettings
 
 _NEAREST = 1e9
-"""Stands for the inverse depth of unknown pixels where the least is looked for."""
+"""Inverse depth of unknown pixels where the least is searched."""
 
 
 @dataclass(frozen=True)
@@ -28,24 +28,24 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class SweptDepth:
-    """A keyframe's own depth before it is held against the others."""
+    """A keyframe's own depth before it is checked against the others."""
 
     inverse: Tensor
     """Shape (h, w)."""
     sigma: Tensor
     """Standard deviation of the inverse depth by parallax and texture. Shape (h, w)."""
     known: Tensor
-    """Where the match means something. Shape (h, w), bool."""
+    """Where the match is valid. Shape (h, w), bool."""
 
 
 def agree_and_fuse(
     seen: SweptDepth, others: Sequence[SweptDepth], warps: Sequence[Warp], settings: DepthFusionSettings
 ) -> DepthMap:
-    """Return what other keyframes confirm of a keyframe's depth, averaged with theirs."""
+    """Return a keyframe's depth where other keyframes confirm it, averaged with theirs."""
     inverse, variance = seen.inverse, seen.sigma**2
     total, weight = inverse / variance, 1.0 / variance
     square = inverse * total
-    agree, deny, looked = (torch.zeros_like(inverse) for _ in range(3))
+    agree, deny, sampled = (torch.zeros_like(inverse) for _ in range(3))
     for other, warp in zip(others, warps, strict=True):
         x, y, ratio = warp.place(inverse)
         read, inside = look_up(other.inverse, x, y, "nearest")
@@ -58,7 +58,7 @@ def agree_and_fuse(
         seen_there = inside & (known > 0.5)
         near = seen_there & (difference.abs() < limit)
         agree += near
-        looked += inside
+        sampled += inside
         deny += seen_there & (difference < -2.0 * limit)
         w = near / (theirs * gain).clamp_min(1e-9) ** 2
         total += w * (inverse + difference)
@@ -66,7 +66,7 @@ def agree_and_fuse(
         weight += w
     mean = total / weight
     scatter = (square / weight - mean * mean).clamp_min(0.0)
-    needed = looked.clamp(1.0, float(settings.least_agree))
+    needed = sampled.clamp(1.0, float(settings.least_agree))
     keep = seen.known & (agree >= needed) & (agree > deny)
     noise = variance / (1.0 + 0.5 * agree) + scatter / (1.0 + agree)
     sigma = torch.sqrt(noise) / mean.clamp_min(1e-9) + settings.drift
@@ -75,9 +75,9 @@ def agree_and_fuse(
 
 
 def fill_flat(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
-    """Small holes in flat surroundings filled with the plane of what is known around them, and said to be unsure.
+    """Fill small holes in flat surroundings with the plane of the known pixels around, at high sigma.
 
-    Inverse depth of a plane is linear in the pixel's place, so the plane is a regression by window sums.
+    Inverse depth of a plane is linear in the pixel's position, so the plane is a regression by window sums.
     """
     inverse, radius = depth.inverse.cpu().numpy(), settings.fill_radius_px
     hole, plane = fill_holes(inverse, radius, settings.fill_share * (2 * radius + 1) ** 2, settings.fill_residual)
@@ -87,11 +87,11 @@ def fill_flat(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
     return DepthMap(torch.from_numpy(filled).to(device), torch.from_numpy(unsure).to(device))
 
 
-def carry(maps: Sequence[DepthMap], warps: Sequence[Warp], settings: DepthFusionSettings) -> DepthMap:
-    """Depth of keyframes as another frame sees it: what is nearest in each pixel, averaged. `warps` lead into it."""
+def project_depth(maps: Sequence[DepthMap], warps: Sequence[Warp], settings: DepthFusionSettings) -> DepthMap:
+    """Depth of keyframes projected into another frame: the nearest in each pixel, averaged. `warps` lead into it."""
     inverse, sigma = stacked([m.inverse for m in maps]), stacked([m.sigma for m in maps])
     rotated, shift = stacked([w.rotated for w in warps]), stacked([w.shift for w in warps])
-    found = splat(inverse, sigma, rotated, shift, settings.carried_tolerance)
+    found = splat(inverse, sigma, rotated, shift, settings.projected_tolerance)
     return DepthMap(*(torch.from_numpy(image).to(maps[0].inverse.device) for image in found))
 
 
@@ -99,7 +99,7 @@ def enlarge(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, step: floa
     """Inverse depth and sigma at the size of the picture `full` (H, W), by joint bilateral upsampling.
 
     Kopf et al. 2007: each large pixel takes the four small ones around it, those of its own brightness most; where
-    they lie on two surfaces (`step` apart, share of depth) those of the surface that fits better.
+    they are on two surfaces (`step` apart, share of depth) those of the surface that fits better.
     """
     if full.device.type == "cpu":
         small = depth.inverse.numpy(), depth.sigma.numpy(), np.ascontiguousarray(gray.numpy())
@@ -144,7 +144,7 @@ def _enlarged_tensors(depth: DepthMap, gray: Tensor, full: Tensor, edge: float, 
 
 
 def speckles_out(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
-    """Depth without pixels that few neighbours of about the same depth surround."""
+    """Depth without pixels that have few neighbours of about the same depth."""
     known = (depth.inverse > 0).float()
     radius = settings.speckle_radius_px
     alone = box_sum(known, radius) < settings.speckle_share * (2 * radius + 1) ** 2
@@ -153,10 +153,10 @@ def speckles_out(depth: DepthMap, settings: DepthFusionSettings) -> DepthMap:
 
 
 def rims_out(depth: DepthMap, reach: int, step: float) -> DepthMap:
-    """Depth without the outer pixels of what stands before something farther: within `reach` px of a `step` of depth.
+    """Depth without the outer pixels of foreground surfaces: within `reach` px of a `step` of depth.
 
-    Windows at an outline hold both surfaces, so that what stands in front comes out wider than it is
-    (research/colour-video 0187). `step` is a share of depth, beyond what a plane changes there.
+    Windows at an outline contain both surfaces, so that the foreground comes out too wide (research/colour-video 0187).
+    `step` is a share of depth, beyond the change of a plane there.
     """
     inverse, known = depth.inverse, depth.inverse > 0
     none = torch.full((), _NEAREST, device=inverse.device)

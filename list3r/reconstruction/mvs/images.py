@@ -1,4 +1,4 @@
-"""Frames of a chunk as the stereo sees them: small grey pictures, cameras and poses as tensors."""
+"""Frames of a chunk as inputs of the stereo: small grey pictures, cameras and poses as tensors."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def make_pictures(frames: Sequence[Frame], camera: Camera, width: int, device: s
 
 
 def sharpness(gray: NDArray[np.float32]) -> float:
-    """Return how sharp a picture is: variance of its Laplacian."""
+    """Return the sharpness of a picture: variance of its Laplacian."""
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
 @dataclass(frozen=True)
 class Warp:
-    """Where the pixels of one picture lie in another: x ~ rotated + inverse depth * shift, homogeneous pixels."""
+    """Projection of one picture's pixels into another: x ~ rotated + inverse depth * shift, homogeneous pixels."""
 
     rotated: Tensor
     """Shape (3, h, w)."""
@@ -75,7 +75,7 @@ class Warp:
 
 @lru_cache(maxsize=4)
 def _pixels(height: int, width: int) -> NDArray[np.float64]:
-    """Homogeneous places of the pixels of a picture. Shape (3, height * width)."""
+    """Homogeneous coordinates of the pixels of a picture. Shape (3, height * width)."""
     v, u = np.mgrid[:height, :width].astype(np.float64)
     return np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
 
@@ -86,7 +86,7 @@ def stacked(images: Sequence[Tensor]) -> NDArray[np.float32]:
 
 
 def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> tuple[Tensor, Tensor]:
-    """Values of an image (h, w) at pixel places (..., h', w'), and where those lie inside it."""
+    """Values of an image (h, w) at positions (..., h', w'), and which of these are inside it."""
     height, width = image.shape
     grid = torch.stack([x * (2.0 / max(width - 1, 1)) - 1.0, y * (2.0 / max(height - 1, 1)) - 1.0], dim=-1)
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
@@ -98,7 +98,7 @@ def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> tupl
 
 
 def box_sum(values: Tensor, radius: int) -> Tensor:
-    """Sums over windows of 2 radius + 1 squared, the picture repeated beyond its border. Shape (..., h, w)."""
+    """Sums over windows of 2 radius + 1 squared, the picture replicated beyond its border. Shape (..., h, w)."""
     if radius == 0:
         return values
     shape = values.shape

@@ -1,4 +1,4 @@
-"""Loops over pixels that dense depth spends most of its time in, on a processor."""
+"""CPU loops over pixels in which dense depth spends most of its time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ZERO, _HALF, _ONE, _BEHIND = np.float32(0.0), np.float32(0.5), np.float32(1.0),
 _LEAST = np.float32(0.05)
 """Share of a pixel that counts."""
 _HIDING = np.float32(0.2)
-"""Share of a pixel from which a point hides what lies behind it."""
+"""Share of a pixel from which a point occludes points behind it."""
 
 
 @compiled
@@ -22,9 +22,8 @@ def zncc_cost(
 ) -> Floats:
     """Return the mean matching cost of inverse depths over sources, 0.5 where no source sees the place.
 
-    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `ways`,
-    (S, 3, h, w) turned and (S, 3) shifted, tell where pixels lie in them; `depths` (D, h, w) or (D, 1, 1).
-    Shape (D, h, w).
+    `reference` is brightness and its mean and variance in windows, shape (3, h, w); `sources` (S, h, w); `ways`, (S, 3,
+    h, w) rotated and (S, 3) shifted, project pixels into them; `depths` (D, h, w) or (D, 1, 1). Shape (D, h, w).
     """
     _, height, width = reference.shape
     rotated, shift = ways
@@ -52,9 +51,7 @@ def zncc_cost(
 
 @compiled
 def _place_row(to: Floats, by: Floats, v: int, inverse: Floats, place: Floats, inside: Floats) -> None:
-    """Write where the pixels of a row lie in another picture, at its border where they are outside, and which are
-    inside.
-    """
+    """Write the projections of a row's pixels into another picture, clamped to its border, and which are inside."""
     right, bottom = np.float32(to.shape[2] - 1), np.float32(to.shape[1] - 1)
     dx, dy, dz = by[0], by[1], by[2]
     for u in range(to.shape[2]):
@@ -69,9 +66,9 @@ def _place_row(to: Floats, by: Floats, v: int, inverse: Floats, place: Floats, i
 
 @compiled
 def _look_up_row(source: Floats, place: Floats, line: Floats, radius: int) -> None:
-    """Write the brightness of a picture at places (2, w) inside it into a line, which is wider by the radius.
+    """Write the brightness of a picture at positions (2, w) inside it into a line, which is wider by the radius.
 
-    Numbers without a sign are looked up several at a time.
+    Unsigned numbers are read several at a time.
     """
     height, width = source.shape
     flat, x, y, values = source.reshape(height * width), place[0], place[1], line[0]
@@ -110,7 +107,7 @@ def _row_sums(line: Floats, reference: Floats, v: int, radius: int, sums: Floats
 def _add_zncc(reference: Floats, sums: Floats, inside: Floats, radius: int, noise: np.float32, total: Floats) -> None:
     """Add the correlation of windows to a total, where a source sees the place.
 
-    Loops run through rows that were taken out of their arrays before, several pixels at a time.
+    Loops run over rows taken out of their arrays before, several pixels at a time.
     """
     _, height, width = reference.shape
     size, window = np.float32((2 * radius + 1) ** 2), np.empty((3, width), np.float32)
@@ -140,9 +137,8 @@ def _column_sums(values: Floats, v: int, radius: int, out: Floats) -> None:
 
 @compiled
 def lowest(cost: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the place of the least of costs (D, h, w), D >= 3, by a parabola, and its whole plane; see
-    `sweep.below_planes`.
-    """
+    """Return the position of the least of costs (D, h, w), D >= 3, by a parabola, and its whole plane; see
+    `sweep.below_planes`."""
     depths, height, width = cost.shape
     place, plane = np.empty((height, width), np.float32), np.empty((height, width), np.int64)
     least, first = np.empty(width, np.float32), np.empty(width, np.int32)
@@ -158,8 +154,8 @@ def lowest(cost: Floats) -> tuple[Floats, NDArray[np.int64]]:
         for u in range(width):
             d = min(max(int(first[u]), 1), depths - 2)
             left, middle, right = cost[d - 1, v, u], cost[d, v, u], cost[d + 1, v, u]
-            bend = max(left - np.float32(2.0) * middle + right, np.float32(1e-6))
-            offset = min(max(_HALF * (left - right) / bend, -_ONE), _ONE)
+            curvature = max(left - np.float32(2.0) * middle + right, np.float32(1e-6))
+            offset = min(max(_HALF * (left - right) / curvature, -_ONE), _ONE)
             place[v, u], plane[v, u] = np.float32(d) + offset, d
     return place, plane
 
@@ -193,7 +189,7 @@ def path_costs(volume: Floats, large: Floats, small: np.float32) -> Floats:
 
 @compiled
 def _next_on_path(path: Floats, cost: Floats, large: np.float32, small: np.float32) -> None:
-    """Write the costs of paths (D + 2,), which end with infinity on either side, at a next place of costs (D,)."""
+    """Write the path costs (D + 2,), padded with infinity on either side, at the next pixel of costs (D,)."""
     least = path[1]
     for d in range(2, len(cost) + 1):
         least = min(least, path[d])
@@ -208,9 +204,9 @@ def _next_on_path(path: Floats, cost: Floats, large: np.float32, small: np.float
 def fill_holes(
     inverse: Floats, radius: int, least: float, residual: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return where holes in flat surroundings are, and the planes of these there. Shape (h, w) each.
+    """Return where holes in flat surroundings are, and their planes. Shape (h, w) each.
 
-    `least` pixels of the window must be known, and deviate from a plane by `residual` of its inverse depth at the most.
+    `least` pixels of the window must be known, and deviate from a plane by at most `residual` of its inverse depth.
     """
     height, width = inverse.shape
     sums = np.zeros((10, height + 1, width), np.float64)
@@ -251,7 +247,7 @@ def fill_holes(
 
 @compiled
 def _enclosed(inverse: Floats, v: int, u: int, radius: int) -> bool:
-    """Return whether something is known within `radius` on the left, on the right, above and below."""
+    """Return whether a pixel is known within `radius` on the left, on the right, above and below."""
     for dv, du in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         found = False
         for k in range(1, radius + 1):
@@ -266,10 +262,10 @@ def _enclosed(inverse: Floats, v: int, u: int, radius: int) -> bool:
 
 @compiled
 def splat(inverse: Floats, sigma: Floats, rotated: Floats, shift: Floats, tolerance: float) -> tuple[Floats, Floats]:
-    """Return the inverse depth and sigma of maps (M, h, w) as another frame sees them: what is nearest, averaged.
+    """Return the inverse depth and sigma of maps (M, h, w) projected into another frame: the nearest, averaged.
 
-    Each point counts in the four pixels around it; those that lie behind the nearest by more than a `tolerance`, share
-    of depth, do not. `rotated` (M, 3, h, w) and `shift` (M, 3) tell where pixels lie. Shape (h, w) each.
+    Each point counts in the four pixels around it, unless it is behind the nearest by more than a `tolerance`, share
+    of depth. `rotated` (M, 3, h, w) and `shift` (M, 3) project pixels. Shape (h, w) each.
     """
     count, height, width = inverse.shape
     nearest, front = np.zeros((height, width), np.float32), np.float32(1.0 - tolerance)
@@ -285,7 +281,7 @@ def splat(inverse: Floats, sigma: Floats, rotated: Floats, shift: Floats, tolera
 
 @compiled
 def _keep_nearest(places: Floats, nearest: Floats) -> None:
-    """Write the greatest inverse depth of the points that lie on each pixel."""
+    """Write the greatest inverse depth of the points on each pixel."""
     height, width = nearest.shape
     for k in range(places.shape[1]):
         column, row, right, down = _corner(places[0, k], places[1, k])
@@ -297,7 +293,7 @@ def _keep_nearest(places: Floats, nearest: Floats) -> None:
 
 @compiled
 def _add_shares(places: Floats, front: Floats, mean: Floats, error: Floats, total: Floats) -> None:
-    """Add what the points around each pixel, of those before its `front`, say, by their weights."""
+    """Add the weighted points around each pixel that are before its `front`."""
     height, width = front.shape
     for k in range(places.shape[1]):
         column, row, right, down = _corner(places[0, k], places[1, k])
@@ -314,7 +310,7 @@ def _add_shares(places: Floats, front: Floats, mean: Floats, error: Floats, tota
 
 @compiled
 def _landed(inverse: Floats, sigma: Floats, to: Floats, by: Floats) -> Floats:
-    """Return places (x, y) in another frame of the points of a map, their inverse depth there and sigma. (4, N)."""
+    """Return positions (x, y) in another frame of the points of a map, their inverse depth there and sigma. (4, N)."""
     height, width = inverse.shape
     out, count = np.empty((4, height * width), np.float32), 0
     for v in range(height):
@@ -332,14 +328,14 @@ def _landed(inverse: Floats, sigma: Floats, to: Floats, by: Floats) -> Floats:
 
 @compiled
 def _corner(x: np.float32, y: np.float32) -> tuple[int, int, np.float32, np.float32]:
-    """Return column and row of the pixel left above a place, and how far right and below it the place lies."""
+    """Return column and row of the pixel left above a position, and the offset right and below it."""
     column, row = int(np.floor(x)), int(np.floor(y))
     return column, row, x - np.float32(column), y - np.float32(row)
 
 
 @compiled
 def _share(right: np.float32, down: np.float32, n: int) -> np.float32:
-    """Return the bilinear share of one of the four pixels around a place."""
+    """Return the bilinear share of one of the four pixels around a position."""
     return (right if n % 2 else _ONE - right) * (down if n // 2 else _ONE - down)
 
 

@@ -1,7 +1,7 @@
-"""A network that reads depth from the costs of a plane sweep and the picture, and says how far it may be off.
+"""A network that estimates depth and its error from plane sweep costs and the picture.
 
-A small U-Net: the costs of 64 depths tell where something matches, the picture what belongs together where nothing
-does. It learned from rooms made from seeds (`training/sweep.py`, MODEL_CARD.md, research/colour-video 0199).
+A small U-Net: the costs of 64 depths show matches, the picture extends them over textureless surfaces. It was trained
+on procedurally generated rooms (`training/sweep.py`, MODEL_CARD.md, research/colour-video 0199).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from list3r.reconstruction.mvs.images import Tensor
 from list3r.reconstruction.mvs.weights import read_weights
 
 PLANES = 64
-"""Depths whose costs the network sees."""
+"""Depths of the network's input costs."""
 SIDE_FEATURES = 3
 """See `side_features`."""
 
 _BLOCK = 12
-"""Values of a picture under one cost: four pixels of three colours."""
+"""Values of a picture per cost: four pixels of three colours."""
 
 
 class _Residual(nn.Module):
-    """Two convolutions beside a short cut (He et al. 2016)."""
+    """Two convolutions with a skip connection (He et al. 2016)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -47,14 +47,14 @@ class _Residual(nn.Module):
 
 @dataclass(frozen=True)
 class SweepPrediction:
-    """What the network says of B keyframes. Places are numbers of planes, with fractions."""
+    """The network's output for B keyframes. Places are numbers of planes, with fractions."""
 
     logits: Tensor
     """Of each plane. Shape (B, 64, h, w)."""
     place: Tensor
     """Shape (B, 2h, 2w)."""
     log_error: Tensor
-    """Logarithm of the mean relative error of depth that is expected (Laplace). Shape (B, 2h, 2w)."""
+    """Logarithm of the expected mean relative error of depth (Laplace). Shape (B, 2h, 2w)."""
 
 
 class SweepNetwork(nn.Module):
@@ -104,7 +104,7 @@ def _convex(place: Tensor, weights: Tensor) -> Tensor:
 
 
 def side_features(span: tuple[float, float], parallax_px: float, sources: int) -> NDArray[np.float32]:
-    """Return what costs do not show: how far apart the planes lie, how far they reach, and the number of sources.
+    """Return inputs that costs do not show: the planes' spacing and range, and the number of sources.
 
     `span` is the least and greatest inverse depth; one unit of it moves a pixel by `parallax_px`. Shape (3,).
     """
@@ -122,13 +122,13 @@ def network_costs(cost: Tensor) -> Tensor:
 
 
 def network_picture(color: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """Return a picture as the network sees it beside costs of a size. Shape (2 height, 2 width, 3)."""
+    """Return a picture at the network's input size for costs of a size. Shape (2 height, 2 width, 3)."""
     return np.asarray(cv2.resize(color, (2 * width, 2 * height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 @lru_cache(maxsize=2)
 def load_network(path: Path | None = None, device: str = "cpu") -> SweepNetwork:
-    """Return the trained network, by default the shipped one. Raises `OptionError` for what is wrong with its file."""
+    """Return the trained network, by default the shipped one. Raises `OptionError` for an invalid file."""
     network = SweepNetwork()
     network.load_state_dict({name: torch.from_numpy(value) for name, value in read_weights(path).items()})
     return network.eval().requires_grad_(False).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
@@ -137,7 +137,7 @@ def load_network(path: Path | None = None, device: str = "cpu") -> SweepNetwork:
 def predict_depth(
     network: SweepNetwork, cost: Tensor, color: NDArray[np.uint8], span: tuple[float, float], side: NDArray[np.float32]
 ) -> tuple[Tensor, Tensor]:
-    """Return inverse depth and its mean relative error, of costs (D, h, w) in [0, 1]. Shape (2h, 2w) each.
+    """Return inverse depth and its mean relative error, from costs (D, h, w) in [0, 1]. Shape (2h, 2w) each.
 
     `color` is the whole RGB picture; `span` holds the inverse depths of the first and the last plane.
     """

@@ -1,8 +1,8 @@
 """Dense depth of a chunk of RGB frames whose poses are known: plane sweep, consistency, fusion.
 
 Keyframes are swept (`sweep`): ZNCC at a coarse width over all depths, paths, refinement at the working width; where
-that leaves doubt, a network reads the same costs and the picture (`network`). What other keyframes confirm is kept and
-fused (`fusion`), flat holes are filled and said to be unsure (`fill`), and every frame gets the depth of the keyframes
+matches are doubtful, a network reads the same costs and the picture (`network`). Depth that other keyframes confirm is
+kept and fused (`fusion`), flat holes are filled at low confidence (`fill`), and every frame gets the depth of the
 around it. Depth without parallax, or with no texture near it, stays unknown (decisions 0068, 0199).
 """
 
@@ -24,9 +24,9 @@ from list3r.reconstruction.mvs.fusion import (
     DepthMap,
     SweptDepth,
     agree_and_fuse,
-    carry,
     enlarge,
     fill_flat,
+    project_depth,
     rims_out,
     speckles_out,
 )
@@ -47,9 +47,9 @@ from list3r.reconstruction.mvs.sweep import (
 )
 from list3r.reconstruction.mvs.views import (
     ViewPairs,
-    choose_carried,
     choose_keyframes,
     choose_neighbours,
+    choose_projected,
     choose_sources,
     pair_views,
     plane_depths,
@@ -59,12 +59,12 @@ from list3r.reconstruction.mvs.views import (
 __all__ = ["KeyframeCosts", "MvsSettings", "PosedFrames", "Sparse", "dense_depth", "keyframe_costs", "stereo_noise"]
 
 Sparse = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Places (N, 2) in px and depths (N,) of a frame's triangulated points."""
+"""Pixels (N, 2) and depths (N,) of a frame's triangulated points."""
 
 
 @dataclass(frozen=True)
 class _Chunk:
-    """What every step looks at."""
+    """Inputs of every step."""
 
     frames: Sequence[Frame]
     T_chunk_cam: Poses
@@ -77,7 +77,7 @@ class _Chunk:
     depth: NDArray[np.float64]
     """Typical depth of each frame, chunk units. Shape (F,)."""
     span: tuple[float, float]
-    """Nearest and farthest depth looked for, chunk units."""
+    """Nearest and farthest depth of the search, chunk units."""
     sharp: NDArray[np.float64]
     device: str
     settings: MvsSettings
@@ -96,7 +96,7 @@ class KeyframeCosts:
     cost: Tensor
     """In [0, 1]. Shape (D, h, w)."""
     parallax_px: float
-    """How far one unit of inverse depth moves a pixel."""
+    """Pixels that one unit of inverse depth moves a point."""
 
     @property
     def span(self) -> tuple[float, float]:
@@ -104,7 +104,7 @@ class KeyframeCosts:
         return float(self.planes[0]), float(self.planes[-1])
 
     def side_features(self) -> NDArray[np.float32]:
-        """Return what the network sees beside costs and picture. Shape (3,)."""
+        """Return the network's inputs other than costs and picture. Shape (3,)."""
         return side_features(self.span, self.parallax_px, len(self.sources))
 
 
@@ -114,12 +114,12 @@ class PosedFrames:
 
     frames: Sequence[Frame]
     posed: NDArray[np.bool_]
-    """Frames whose pose means something; the others get no depth. Shape (F,)."""
+    """Frames with a valid pose; the others get no depth. Shape (F,)."""
     T_chunk_cam: Poses
     """Shape (F, 4, 4)."""
     camera: Camera
     sparse: Sequence[Sparse | None] | None = None
-    """Triangulated points of each frame where there are some: they tell between which depths to look."""
+    """Triangulated points of each frame where there are some: they bound the searched depths."""
 
 
 def dense_depth(
@@ -127,7 +127,7 @@ def dense_depth(
 ) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
     """Return depth along z, chunk units, 0 where unknown, and confidence of every frame. Shape (F, H, W) each.
 
-    Confidence in [0, 1] is 1 / (1 + (sigma / half_sigma)^2) of the deviation that is expected.
+    Confidence in [0, 1] is 1 / (1 + (sigma / half_sigma)^2) of the expected deviation.
     """
     frames, camera = given.frames, given.camera
     shape = (len(frames), camera.height, camera.width)
@@ -148,7 +148,7 @@ def dense_depth(
 
 
 def keyframe_costs(given: PosedFrames, settings: MvsSettings | None = None, device: str = "cpu") -> list[KeyframeCosts]:
-    """Return the costs of the keyframes as `dense_depth` matches them, for what learns from them."""
+    """Return the costs of the keyframes as `dense_depth` matches them, for training."""
     with torch.inference_mode(), _one_thread():
         chunk = _prepare(given, settings or MvsSettings(), device)
         rows = range(0 if chunk is None else len(chunk.keyframes))
@@ -158,7 +158,7 @@ def keyframe_costs(given: PosedFrames, settings: MvsSettings | None = None, devi
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Torch with one thread: where work is cut into pieces decides the last bits of vectorised functions."""
+    """Torch with one thread: the split of work decides the last bits of vectorised functions."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -170,9 +170,9 @@ def _one_thread() -> Iterator[None]:
 def stereo_noise(
     depth: NDArray[np.float32], confidence: NDArray[np.float16], settings: MatchTrustSettings | None = None
 ) -> DepthNoise | None:
-    """Return how rough stereo depth (F, H, W) is: what small windows deviate from a plane, growing with depth squared.
+    """Return the noise of stereo depth (F, H, W): deviations of small windows from a plane, growing with depth squared.
 
-    None where too little is known to measure it. Structure looks like roughness, so the smoother windows decide.
+    None where too little is known to measure it. Structure resembles noise, so the smoother windows decide.
     """
     chosen = settings or MatchTrustSettings()
     used = np.flatnonzero((depth > 0).any(axis=(1, 2)))
@@ -205,7 +205,7 @@ def plane_residual(inverse: NDArray[np.float64], radius: int) -> NDArray[np.floa
 
 
 def _prepare(given: PosedFrames, settings: MvsSettings, device: str) -> _Chunk | None:
-    """Return what every step looks at; None where the cameras do not move."""
+    """Return the inputs of every step; None where the cameras do not move."""
     frames, posed, camera, sparse = given.frames, given.posed, given.camera, given.sparse
     T = np.where(posed[:, None, None], given.T_chunk_cam, np.eye(4))
     coarse = make_pictures(frames, camera, min(settings.sweep.coarse_width_px, camera.width), device)
@@ -272,7 +272,7 @@ def _probe(
 
 
 def _probed(chunk: _Chunk, row: int) -> NDArray[np.float64]:
-    """Depths of the pixels of a keyframe that leave no doubt."""
+    """Depths of the pixels of a keyframe with unambiguous matches."""
     swept = _costs(chunk, row)
     if swept is None:
         return np.zeros(0)
@@ -303,7 +303,7 @@ def _coarse(chunk: _Chunk, swept: KeyframeCosts) -> CoarseDepth:
 
 
 def _parallax_px(chunk: _Chunk, row: int, sources: list[int], camera: Camera) -> float:
-    """Return how far one unit of inverse depth moves a pixel in the sources, px: the upper quartile."""
+    """Return the pixels that one unit of inverse depth moves a point in the sources: the upper quartile."""
     angle = np.radians(chunk.pairs.angle_deg[row, sources])
     return float(np.quantile(np.tan(angle), 0.75) * chunk.depth[chunk.keyframes[row]] * camera.fx)
 
@@ -314,18 +314,18 @@ def _warps(chunk: _Chunk, key: int, others: Sequence[int], camera: Camera) -> li
 
 
 def _sweep(chunk: _Chunk, row: int) -> SweptDepth | None:
-    """Return a keyframe's own depth by matches, and by the network where they tell none; None without parallax."""
+    """Return a keyframe's own depth by matches, elsewhere by the network; None without parallax."""
     swept = _costs(chunk, row)
     if swept is None:
         return None
     match = _matched(chunk, row, swept)
     if chunk.settings.network is None:
         return match
-    told = _predicted(chunk, swept, match, chunk.settings.network)
+    predicted = _predicted(chunk, swept, match, chunk.settings.network)
     return SweptDepth(
-        torch.where(match.known, match.inverse, told.inverse),
-        torch.where(match.known, match.sigma, told.sigma),
-        match.known | told.known,
+        torch.where(match.known, match.inverse, predicted.inverse),
+        torch.where(match.known, match.sigma, predicted.sigma),
+        match.known | predicted.known,
     )
 
 
@@ -342,7 +342,7 @@ def _matched(chunk: _Chunk, row: int, swept: KeyframeCosts) -> SweptDepth:
 
 
 def _predicted(chunk: _Chunk, swept: KeyframeCosts, match: SweptDepth, settings: SweepNetworkSettings) -> SweptDepth:
-    """Return the depth that the network reads from costs and picture, near matches that it agrees with."""
+    """Return the depth that the network predicts from costs and picture, near matches that it agrees with."""
     network, color = load_network(device=chunk.device), chunk.frames[swept.key].color
     inverse, error = predict_depth(network, swept.cost, color, swept.span, swept.side_features())
     inverse, error = _resized(inverse, match.inverse.shape), _resized(error, match.inverse.shape)
@@ -391,22 +391,22 @@ def _filled(chunk: _Chunk, row: int, depth: DepthMap) -> DepthMap:
 
 
 def _frame_map(chunk: _Chunk, maps: dict[int, DepthMap], position: int) -> DepthMap | None:
-    """Depth of a frame at the working width, from the keyframes nearest to it; None where there are none."""
+    """Depth of a frame at the working width, from the nearest keyframes; None without any."""
     known = sorted(maps)
     if not known:
         return None
     overlap = np.array([chunk.pairs.overlap[row, position] for row in known])
     overlap[[chunk.keyframes[row] == position for row in known]] = 1.0
     apart = np.array([abs(chunk.keyframes[row] - position) for row in known])
-    best = choose_carried(overlap, chunk.parts[position, known], apart, chunk.settings.fusion)
+    best = choose_projected(overlap, chunk.parts[position, known], apart, chunk.settings.fusion)
     rows = [known[k] for k in best]
     if not rows:
         return None
     T = chunk.T_chunk_cam
     warps = [Warp.between(T[chunk.keyframes[r]], T[position], chunk.fine.camera, chunk.device) for r in rows]
-    carried = carry([maps[r] for r in rows], warps, chunk.settings.fusion)
+    projected = project_depth([maps[r] for r in rows], warps, chunk.settings.fusion)
     fusion = chunk.settings.fusion
-    return rims_out(fill_flat(carried, fusion), fusion.carried_rim_px, fusion.rim_step)
+    return rims_out(fill_flat(projected, fusion), fusion.projected_rim_px, fusion.rim_step)
 
 
 def _full_size(

@@ -1,4 +1,4 @@
-"""Plane sweep of one keyframe: matching cost of many depths, aggregated along paths, and refined below the planes."""
+"""Plane sweep of one keyframe: matching cost of many depths, aggregated along paths, and refined between planes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from list3r.reconstruction.mvs.settings import SweepSettings
 
 @dataclass(frozen=True)
 class DepthMatch:
-    """What one keyframe sees by itself. All images share their shape (h, w)."""
+    """The match of one keyframe with its sources. All images share their shape (h, w)."""
 
     inverse_depth: Tensor
     """1 / chunk units."""
@@ -31,7 +31,7 @@ class DepthMatch:
 
 @dataclass(frozen=True)
 class CoarseDepth:
-    """What the planes tell of a keyframe."""
+    """Depth of a keyframe by the planes."""
 
     inverse: Tensor
     """Inverse depth, 1 / chunk units. Shape (h, w)."""
@@ -65,8 +65,8 @@ def matching_cost(
     """Cost in [0, 1] of inverse depths (D, 1, 1) or (D, h, w). Shape (D, h, w).
 
     ZNCC over windows (Kanade and Okutomi 1994 name the windows, Collins 1996 the sweep) with noise in the variances,
-    so that flat windows tell nothing (0.5). The sources come in two groups, each of which may be hidden (Kang, Szeliski
-    and Chai 2001): the better group counts for most.
+    so that flat windows cost 0.5. The sources are in two groups, each of which may be occluded (Kang, Szeliski and Chai
+    2001): the better group counts for most.
     """
     groups = [sources[0::2], sources[1::2]], [warps[0::2], warps[1::2]]
     means = [
@@ -132,7 +132,7 @@ def _paths(volume: Tensor, gray: Tensor, settings: SweepSettings) -> Tensor:
 
 
 def _larger_steps(gray: Tensor, settings: SweepSettings) -> Tensor:
-    """Return what a step of more than one depth costs from each place to the next. Shape (n - 1, m)."""
+    """Return the cost of a step of more than one depth from each pixel to the next. Shape (n - 1, m)."""
     change = (gray[1:] - gray[:-1]).abs()
     return (settings.path_large / (1.0 + change / settings.path_edge)).clamp_min(1.5 * settings.path_small)
 
@@ -155,7 +155,7 @@ def _paths_of_tensors(volume: Tensor, gray: Tensor, settings: SweepSettings) -> 
 
 
 def below_planes(cost: Tensor) -> tuple[Tensor, Tensor]:
-    """Place of the least of costs (D, h, w) by a parabola, and its whole plane. Shape (h, w) each."""
+    """Position of the least of costs (D, h, w) by a parabola, and its whole plane. Shape (h, w) each."""
     if cost.device.type == "cpu":
         found, number = lowest(cost.contiguous().numpy())
         return torch.from_numpy(found), torch.from_numpy(number)
@@ -187,11 +187,11 @@ def choose_at_edges(
     spacing: float,
     settings: SweepSettings,
 ) -> tuple[Tensor, Tensor]:
-    """Inverse depths (h, w) that stay, or become those of the nearest or farthest surface close by; and where that
+    """Inverse depths (h, w), kept or replaced by those of the nearest or farthest surface close by; and where that
     is in doubt.
 
-    The smallest windows decide, and the evidence of neighbours counts as far as they look alike (adaptive support
-    weights, Yoon and Kweon 2006): coarse windows make what stands in front wider than it is.
+    The smallest windows decide, and neighbours are weighted by similar brightness (adaptive support weights, Yoon and
+    Kweon 2006): coarse windows make the foreground too wide.
     """
     front, back = greatest_around(start, settings.edge_reach_px), -greatest_around(-start, settings.edge_reach_px)
     small = replace(settings, radius_px=1)
@@ -206,7 +206,7 @@ def choose_at_edges(
 
 
 def _alike_mean(values: Tensor, gray: Tensor, settings: SweepSettings, radius: int = 6, step: int = 2) -> Tensor:
-    """Means of values (C, h, w) over a window, weighted by likeness of brightness to its middle."""
+    """Means of values (C, h, w) over a window, weighted by similarity of brightness to its middle."""
     height, width = gray.shape
     padded = torch.nn.functional.pad(values[None], (radius,) * 4, mode="replicate")[0]
     around = torch.nn.functional.pad(gray[None, None], (radius,) * 4, mode="replicate")[0, 0]
@@ -228,7 +228,7 @@ def refine(
     coarse: CoarseDepth,
     settings: SweepSettings,
 ) -> DepthMatch:
-    """Return better inverse depths: windows bend with the depth found so far, so slopes are no bias."""
+    """Return better inverse depths: windows follow the slopes of the depth found so far, which then are no bias."""
     start, spacing = coarse.inverse, coarse.spacing
     inverse, doubt = choose_at_edges(reference.gray, sources, warps, start, spacing, settings)
     least = 0.02 * spacing
@@ -248,7 +248,7 @@ def refine(
 
 
 def _median(inverse: Tensor) -> Tensor:
-    """Median of each pixel and its four neighbours: takes out single errors, keeps edges. Shape (h, w)."""
+    """Median of each pixel and its four neighbours: removes single errors, keeps edges. Shape (h, w)."""
     shifted = torch.nn.functional.pad(inverse[None, None], (1,) * 4, mode="replicate")[0, 0]
     height, width = inverse.shape
     around = [shifted[1 + j : 1 + j + height, 1 + i : 1 + i + width] for j, i in _CROSS]

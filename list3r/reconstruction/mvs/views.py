@@ -1,4 +1,4 @@
-"""Which frames get a sweep of their own, which others each is compared with, and between which depths."""
+"""Choose the keyframes of the sweep, the frames that each is compared with, and the range of depths."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ViewPairs:
-    """What every frame sees of what every keyframe sees at the typical depth. Shape (K, F) each."""
+    """Overlap of every keyframe with every frame at the typical depth. Shape (K, F) each."""
 
     overlap: Floats
     """Share of the keyframe's picture, in [0, 1]; 0 for itself and for frames without a pose."""
@@ -30,7 +30,7 @@ class ViewPairs:
 def choose_keyframes(
     posed: NDArray[np.bool_], T_chunk_cam: Poses, depth: Floats, sharp: Floats, settings: SweepViewSettings
 ) -> list[int]:
-    """Positions of the sharpest frame of each run that sees nearly the same. `depth` (F,) is the typical one."""
+    """Positions of the sharpest frame of each run of nearly equal views. `depth` (F,) is the typical one."""
     runs: list[list[int]] = []
     stride = max(1, min(settings.stride, int(posed.sum()) // settings.least_keyframes))
     for position in np.flatnonzero(posed).tolist():
@@ -76,7 +76,7 @@ def _few_rays(camera: Camera) -> Floats:
 
 
 def _inside(points: Floats, T_cam_chunk: NDArray[np.floating], camera: Camera) -> NDArray[np.bool_]:
-    """Return which points (N, 3) lie in which cameras' pictures. Shape (C, N)."""
+    """Return which points (N, 3) are in which cameras' pictures. Shape (C, N)."""
     local = np.einsum("fij,nj->fni", T_cam_chunk[:, :3, :3], points) + T_cam_chunk[:, None, :3, 3]
     z = np.maximum(local[..., 2], 1e-9)
     x, y = local[..., 0] / z * camera.fx + camera.cx, local[..., 1] / z * camera.fy + camera.cy
@@ -95,31 +95,31 @@ def seen_parts(
     return out
 
 
-def choose_carried(
+def choose_projected(
     overlap: Floats, parts: NDArray[np.bool_], apart: NDArray[np.int64], settings: DepthFusionSettings
 ) -> list[int]:
-    """Return the keyframes whose depth a frame takes over, best first.
+    """Return the keyframes whose depth is projected into a frame, best first.
 
-    `overlap` (K,) is the share of each keyframe's picture that the frame sees: closer looks tell depth best. `parts`
-    (K, N) is what each sees of the frame, `apart` (K,) how many frames lie between. First come those that see parts
-    of which few others tell: all close looks at one part lie in the frame as a whole, and leave the rest without depth.
+    `overlap` (K,) is the share of each keyframe's picture that the frame sees: closer views measure depth best. `parts`
+    (K, N) are the parts of the frame that each sees, `apart` (K,) the number of frames between. Keyframes with parts
+    seen by few others come first: all close views of one part would leave the rest of the frame without depth.
     """
     order = [int(k) for k in np.lexsort((apart, -overlap)) if overlap[k] > 0]
-    told, first = np.zeros(parts.shape[1], dtype=np.int64), list[int]()
+    covered, first = np.zeros(parts.shape[1], dtype=np.int64), list[int]()
     for k in order:
-        if (parts[k] & (told < settings.carried_least)).sum() >= 2:
+        if (parts[k] & (covered < settings.projected_least)).sum() >= 2:
             first.append(k)
-            told += parts[k]
-    first = first[: settings.carried_from]
-    return first + [k for k in order if k not in first][: settings.carried_from - len(first)]
+            covered += parts[k]
+    first = first[: settings.projected_from]
+    return first + [k for k in order if k not in first][: settings.projected_from - len(first)]
 
 
 def choose_sources(
     row: int, pairs: ViewPairs, T_chunk_cam: Poses, sharp: Floats, key: int, settings: SweepViewSettings
 ) -> list[int]:
-    """Positions of a keyframe's sources, those of its two sides in turn. Empty where no two have parallax.
+    """Positions of a keyframe's sources, alternating between its two sides. Empty without parallax.
 
-    Best first by overlap, angle and sharpness; who stands where another source stands already counts less.
+    Best first by overlap, angle and sharpness; a camera near another source counts less.
     """
     angle, overlap = pairs.angle_deg[row], pairs.overlap[row]
     usable = (angle > settings.least_deg) & (angle < settings.most_deg) & (overlap > settings.least_overlap)
@@ -136,7 +136,7 @@ def choose_sources(
 
 
 def _in_turn(chosen: list[int], centers: Floats, key: int) -> list[int]:
-    """Sources ordered so that every second one lies on one side of the keyframe as far as that is possible."""
+    """Sources ordered so that they alternate between two sides of the keyframe as far as possible."""
     offsets = centers[chosen] - centers[key]
     axis = np.linalg.svd(offsets)[2][0]
     order = np.argsort(offsets @ axis, kind="stable")
@@ -146,7 +146,7 @@ def _in_turn(chosen: list[int], centers: Floats, key: int) -> list[int]:
 
 
 def choose_neighbours(row: int, keyframes: Sequence[int], pairs: ViewPairs, settings: SweepViewSettings) -> list[int]:
-    """Numbers of the keyframes that see most of the same, from not too different places."""
+    """Numbers of the keyframes of most overlap, from not too different positions."""
     overlap = pairs.overlap[row, list(keyframes)]
     angle = pairs.angle_deg[row, list(keyframes)]
     score = np.where((overlap > settings.least_overlap) & (angle < settings.most_deg), overlap - 0.01 * angle, 0.0)
@@ -157,7 +157,7 @@ def choose_neighbours(row: int, keyframes: Sequence[int], pairs: ViewPairs, sett
 def plane_depths(
     near: float, far: float, parallax_px: float, least: int, most: int, step_px: float = 0.7
 ) -> NDArray[np.float32]:
-    """Inverse depths from far to near, evenly spaced. `parallax_px` is what one unit of inverse depth moves a pixel."""
+    """Inverse depths from far to near, evenly spaced. One unit of inverse depth moves a pixel by `parallax_px`."""
     low, high = 1.0 / far, 1.0 / near
     count = int(np.clip(np.ceil((high - low) * parallax_px / step_px), least, most))
     return np.linspace(low, high, count).astype(np.float32)

@@ -11,5 +11,5 @@ SHIPPED = Path(__file__).with_name("weights.npz")
 
 
 def read_weights(path: Path | None = None) -> dict[str, Float]:
-    """Return the arrays of a file, by default the shipped one. Raises `OptionError` for what is wrong with it."""
+    """Return the arrays of a file, by default the shipped one. Raises `OptionError` for an invalid file."""
     return FORMAT.read(path or SHIPPED, "make it again with training/sweep.py" if path else "install list3r again")

@@ -3,11 +3,11 @@
 Pictures one after another, in [-1, 1], the longer side 512, cut to whole patches of 16. For each come back
 `pts3d_in_self_view` (1, h, w, 3) in its own camera, `conf_self` = 1 + exp(x) (1, h, w), and `camera_pose` (1, 7):
 translation and quaternion (wxyz) of the camera *to* world pose with OpenCV axes, near the identity for the first.
-About metric; taken as relative like the others. Its weights come as a pickle, of which docs/models.md makes a file of
-tensors alone; what they are a network of stands here, or in a `config.json` beside them.
+About metric; taken as relative like the others. Its weights come as a pickle, which docs/models.md converts to a file
+of tensors alone; the network's parameters are set here, or in a `config.json` next to them.
 
-The pose has a token of its own, at place -1. The package's own code for machines without its CUDA extension has no such
-place, so there all places are moved by one, which attention cannot tell.
+The pose has a token of its own, at position -1. The package's own code for machines without its CUDA extension has no
+such position, so there all positions are shifted by one, to which attention is invariant.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ PUBLISHED: dict[str, Any] = {
     "dec_num_heads": 12,
     "landscape_only": False,
 }
-"""What the published weights are a network of."""
+"""The parameters of the published weights' network."""
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
     """Return the network. Raises `OptionError` in one line."""
-    beside = path / "config.json"
-    config = PUBLISHED | (json.loads(beside.read_text(encoding="utf-8")) if beside.is_file() else {})
+    own = path / "config.json"
+    config = PUBLISHED | (json.loads(own.read_text(encoding="utf-8")) if own.is_file() else {})
 
     def make_network() -> Any:
         return cls(cls.config_class(**config))
@@ -95,7 +95,7 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
 
 
 def decode_poses(encoding: np.ndarray) -> np.ndarray:
-    """Camera-to-world poses (n, 4, 4) of encodings (n, 7); NaN where they are none."""
+    """Camera-to-world poses (n, 4, 4) of encodings (n, 7); NaN for invalid ones."""
     e = encoding.astype(np.float64)
     whole = np.isfinite(e).all(axis=1) & (np.linalg.norm(e[:, 3:], axis=1) > 1e-6)
     T = np.full((len(e), 4, 4), np.nan)

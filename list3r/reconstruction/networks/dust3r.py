@@ -2,7 +2,7 @@
 
 Two views of pictures in [-1, 1], the longer side 512, cut to whole patches of 16, go in; `pts3d` of the first and
 `pts3d_in_other_view` of the second, both in the first's camera and at a scale of their own, come out, with `conf` = 1
-+ exp(x). Here pictures that lie 1, 2, 4, ... apart are paired, both ways round (`pairs`). The same serves `mast3r`.
++ exp(x). Here pictures that are 1, 2, 4, ... apart are paired, in both orders (`pairs`). The same serves `mast3r`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> Window
 
 
 def _view(pictures: torch.Tensor, rows: np.ndarray) -> dict[str, Any]:
-    """Return some pictures as one view of as many pairs; their names say that no pair is another turned round."""
+    """Return some pictures as one view of as many pairs; unique names mark that no pair is another one reversed."""
     import torch
 
     shape = torch.tensor([pictures.shape[-2:]], dtype=torch.int32).expand(len(rows), 2)

@@ -1,10 +1,9 @@
 """Reconstruction `fast3r` (Yang et al., "Fast3R: Towards 3D Reconstruction of 1000+ Images in One Forward Pass").
 
-Pictures in [-1, 1], the longer side 512, cut to whole patches of 16. For each come back `pts3d_in_other_view` (1, h,
-w, 3) in the camera of the first picture with `conf` = 1 + exp(x), and from its second head `pts3d_local` in the
-picture's own camera. There are no poses: the focal length is that of the first picture, whose points are in its own
-camera, and a pose is that from which a picture's points are seen at their pixels, as its authors' own evaluation has
-it.
+Pictures in [-1, 1], the longer side 512, cut to whole patches of 16. For each come back `pts3d_in_other_view` (1, h, w,
+3) in the camera of the first picture with `conf` = 1 + exp(x), and from its second head `pts3d_local` in the picture's
+own camera. There are no poses: the focal length is that of the first picture, whose points are in its own camera, and a
+picture's pose is the one that projects its points to their pixels, as in its authors' own evaluation.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def answer(model: Any, pictures: torch.Tensor, K: torch.Tensor | None) -> WindowOutput:
-    """See `feedforward.Answer`; known intrinsics take the place of those that the first picture's points tell."""
+    """See `feedforward.Answer`; known intrinsics replace those of the first picture's points."""
     said = model(views(pictures))
     points = np.concatenate([numpy(s["pts3d_in_other_view"]) for s in said])
     confidence = sigmoid_of_expp1(np.concatenate([numpy(s["conf"]) for s in said]))

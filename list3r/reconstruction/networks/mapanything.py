@@ -1,6 +1,6 @@
 """Reconstruction `mapanything` (Keetha et al., "MapAnything: Universal Feed-Forward Metric 3D Reconstruction").
 
-A list of views, each a dictionary with `img` (1, 3, h, w) normalised as for DINOv2, the word for that, and, where the
+A list of views, each a dictionary with `img` (1, 3, h, w) normalised as for DINOv2, the name of that, and, where the
 user knows them, `intrinsics` (1, 3, 3). For each view come back `depth_z` (1, h, w, 1), `conf` = 1 + exp(x) (1, h, w),
 `camera_poses` (1, 4, 4) camera to world with OpenCV axes, `intrinsics` (1, 3, 3), and `non_ambiguous_mask` (1, h, w).
 Depth is about metric; its users find factors of up to three, so it is taken as relative. Its constructor fetches the

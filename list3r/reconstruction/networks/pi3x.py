@@ -1,8 +1,8 @@
 """Reconstruction `pi3x`, the successor of `pi3`: smoother, and takes known intrinsics.
 
-Told intrinsics count pixels from the picture's corner (the first centre is at a half). `decode` makes a mask over all
-pairs of tokens of all pictures, 9 GB for 100 of them, for poses that nobody gave; so it is not asked to look for poses.
-Its heads take 64 pictures at once, which can need more memory than all that went before.
+Given intrinsics count pixels from the picture's corner (the first centre is at a half). `decode` makes a mask over all
+pairs of tokens of all pictures, 9 GB for 100 of them, for given poses; there are none, so poses are switched off. Its
+heads take 64 pictures at once, which can need more memory than the rest of the network.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """Return the network, whose decoder looks for no poses and whose heads take a few pictures at a time."""
+    """Return the network, whose decoder predicts no poses and whose heads take a few pictures at a time."""
     model = load_upstream(cls, path, device)
     if hasattr(model, "decode"):
         _decode_without_poses(model)

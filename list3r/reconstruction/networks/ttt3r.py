@@ -1,7 +1,7 @@
 """Reconstruction `ttt3r` (Chen et al., "TTT3R: 3D Reconstruction as Test-Time Training").
 
-The network and the weights of `cut3r`, whose state is updated by how much of it attends to a picture, so that long
-videos are forgotten less. Its package has the class of cut3r with one word more in its configuration.
+The network and the weights of `cut3r`, whose state update is weighted by attention to the picture, so that long videos
+are forgotten less. Its package has the class of cut3r with one word more in its configuration.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
     """Return the network, its state updated as TTT3R does. Raises `OptionError` for the package of cut3r."""
-    if not hasattr(cls, "forward_recurrent_lighter"):  # the one way of the two that cut3r has not
+    if not hasattr(cls, "forward_recurrent_lighter"):  # the mode that cut3r has not
         raise OptionError("ttt3r: the first package dust3r on PYTHONPATH is that of cut3r; put src of TTT3R before it")
     model = cut3r.load(cls, path, device)
     model.config.model_update_type = "ttt3r"

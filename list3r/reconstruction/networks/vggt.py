@@ -1,7 +1,7 @@
 """Reconstruction `vggt` (Wang et al., "VGGT: Visual Geometry Grounded Transformer", CVPR 2025).
 
-Pictures (1, n, 3, h, w) in [0, 1], the longer side 518, bicubic; what is taller than wide is filled up with white to
-a square, one of the two things that its loader does (the other cuts off top and bottom). Out come `depth` (1, n, h,
+Pictures (1, n, 3, h, w) in [0, 1], the longer side 518, bicubic; pictures taller than wide are padded with white to a
+square, one of the two modes of its loader (the other crops top and bottom). Out come `depth` (1, n, h,
 w, 1), `depth_conf` = 1 + exp(x), and `pose_enc` (1, n, 9): translation and quaternion (xyzw) of the camera *from*
 world pose with OpenCV axes, then the vertical and the horizontal field of view in radians. The first camera is the
 frame of reference; there is no scale. The heads for world points and for tracks are not needed.
@@ -37,7 +37,7 @@ def make(options: ModelOptions) -> FeedforwardReconstructor:
 
 
 def load(cls: Any, path: Path, device: torch.device) -> Any:
-    """Return the network without the heads whose answers are not read: a quarter of a pass and of its weights."""
+    """Return the network without the heads whose outputs are not read: a quarter of a pass and of its weights."""
     model = load_upstream(cls, path, device)
     model.point_head = model.track_head = None
     return model

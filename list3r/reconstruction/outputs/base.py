@@ -1,6 +1,6 @@
-"""What other programs saved of a video's geometry, brought to the layout of `precomputed`.
+"""Geometry that other programs saved of a video, converted to the layout of `precomputed`.
 
-Each program is one file of this room: it tells whether a path is its output, and reads it.
+Each program is one file of this room: it recognises its output, and reads it.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What a program's files do not say."""
+    """Facts that a program's files do not contain."""
 
     every: int = 1
     """They are of every n-th frame of the video."""
     frame_size: tuple[int, int] | None = None
     """Height and width of the video's frames, px, for programs that cut them; None where nothing was cut."""
     masks: Path | None = None
-    """A folder of EntitySAM with the things of the same frames."""
+    """A folder of EntitySAM with the instances of the same frames."""
 
     def placement(self, loader: Loader, size: tuple[int, int]) -> Placement:
-        """Return how pictures of a size lie in the frames. Raises `SourceError` where the loader makes others of
-        them."""
+        """Return the placement of pictures of a size in the frames. Raises `SourceError` where the loader makes other
+        ones."""
         if self.frame_size is None:
             return Placement(size, size)
         placed = loader.place(*self.frame_size)
@@ -48,7 +48,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class ProgramOutput:
-    """What a program saved."""
+    """The saved output of a program."""
 
     manifest: Manifest
     pieces: Iterator[Piece]
@@ -62,18 +62,18 @@ class OutputReader(Protocol):
     """Of the program, and what it saves."""
 
     def recognises(self, path: Path) -> bool:
-        """Tell whether a path is this program's output."""
+        """Return whether a path is this program's output."""
         ...
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return what was saved. Raises `SourceError` for what does not fit together, `OptionError` for damaged
-        files."""
+        """Return the saved output. Raises `SourceError` for files that do not fit together, `OptionError` for damaged
+        ones."""
         ...
 
 
 @dataclass(frozen=True)
 class Views:
-    """What a program says of n pictures."""
+    """A program's output for n pictures."""
 
     T_world_cam: Array
     """OpenCV axes. Shape (n, 4, 4)."""
@@ -108,7 +108,7 @@ class Views:
 
 
 def homogeneous(rows: NDArray[Any]) -> Array:
-    """Return poses of shape (F, 3, 4), (F, 4, 4) or (F, 16) as (F, 4, 4); none of what has another shape."""
+    """Return poses of shape (F, 3, 4), (F, 4, 4) or (F, 16) as (F, 4, 4); none for any other shape."""
     stated = np.asarray(rows, np.float64)
     stated = stated.reshape(-1, 4, 4) if stated.ndim == 2 and stated.shape[1] == 16 else stated
     if stated.ndim != 3 or stated.shape[1:] not in ((3, 4), (4, 4)):
@@ -119,7 +119,7 @@ def homogeneous(rows: NDArray[Any]) -> Array:
 
 
 def inverses(T: Array) -> Array:
-    """Inverses of poses (F, 4, 4); NaN where a pose is none."""
+    """Inverses of poses (F, 4, 4); NaN for invalid ones."""
     good: NDArray[np.bool_] = np.asarray(np.isfinite(T).all(axis=(1, 2)))
     good[good] = np.abs(np.linalg.det(T[good][:, :3, :3])) > 1e-6
     out = np.full(T.shape, np.nan)

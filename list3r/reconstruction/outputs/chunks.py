@@ -5,7 +5,7 @@ dictionary, which is not read here. docs/precomputed.md has the three lines that
 has `extrinsic` (n, 4, 4), camera to world, `intrinsic` (n, 3, 3) px from the corner, `depth` and `depth_conf` = 1 +
 exp(x); with pi3 inside `world_points` (n, h, w, 3) and `world_points_conf` in [0, 1] instead of the last three.
 Pi-Long has `camera_poses`, camera to world, `local_points` in each camera, and `conf` (n, h, w, 1) in [0, 1]. Length
-and overlap of the chunks stand in the copy of the configuration beside them.
+and overlap of the chunks are in the copy of the configuration next to them.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ _MOST_CONFIGURATION = 2**20
 
 
 class ChunksReader:
-    """What VGGT-Long or Pi-Long saved of their chunks."""
+    """The saved chunks of VGGT-Long or Pi-Long."""
 
     name = f"the folder of VGGT-Long or Pi-Long ({UNALIGNED}/chunk_N.npz)"
 
     def recognises(self, path: Path) -> bool:
-        """Tell whether a folder has their chunks."""
+        """Return whether a folder has their chunks."""
         return (path / UNALIGNED).is_dir()
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return what was saved. Raises `SourceError` and `OptionError`."""
+        """Return the saved output. Raises `SourceError` and `OptionError`."""
         files = sorted((path / UNALIGNED).glob("chunk_*.npz"), key=lambda p: int(re.sub(r"\D", "", p.stem) or 0))
         if not files:
             raise SourceError(f"{path / UNALIGNED} holds no chunk_N.npz: see docs/precomputed.md for chunk_N.npy")
@@ -62,7 +62,7 @@ class ChunksReader:
 
 
 def _plan(path: Path) -> tuple[int, int]:
-    """Return length and overlap of the chunks by the configuration. Raises `SourceError` where it says none."""
+    """Return length and overlap of the chunks in the configuration. Raises `SourceError` where they are missing."""
     for file in sorted(path.glob("*.yaml")):
         text = read_file(file, _MOST_CONFIGURATION).decode("utf-8", "replace")
         found = [re.search(rf"^\s*{name}\s*:\s*(\d+)", text, re.MULTILINE) for name in ("chunk_size", "overlap")]
@@ -74,7 +74,7 @@ def _plan(path: Path) -> tuple[int, int]:
 
 
 def _views(found: dict[str, NDArray[Any]], file: Path) -> tuple[Views, bool]:
-    """Return what a chunk says, and whether its pictures were made by VGGT's loader. Raises `SourceError`."""
+    """Return a chunk's views, and whether its pictures were made by VGGT's loader. Raises `SourceError`."""
     if {"camera_poses", "local_points", "conf"} <= found.keys():
         return _of_points(found["camera_poses"], found["local_points"], found["conf"]), False
     if {"extrinsic", "intrinsic", "depth", "depth_conf"} <= found.keys():

@@ -20,16 +20,16 @@ from list3r.reconstruction.precomputed_files import Manifest, Piece, read_array,
 
 
 class Cut3rReader:
-    """What CUT3R or TTT3R saved, frame by frame."""
+    """The saved frames of CUT3R or TTT3R."""
 
     name = "the output folder of CUT3R or TTT3R (depth, conf, camera)"
 
     def recognises(self, path: Path) -> bool:
-        """Tell whether a folder has the three."""
+        """Return whether a folder has the three."""
         return all((path / name).is_dir() for name in ("depth", "conf", "camera"))
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return what was saved. Raises `SourceError` and `OptionError`."""
+        """Return the saved output. Raises `SourceError` and `OptionError`."""
         names = sorted(p.stem for p in (path / "camera").glob("*.npz"))
         if not names:
             raise SourceError(f"{path / 'camera'} holds no .npz files")

@@ -1,7 +1,7 @@
 """Masks of EntitySAM: the pictures `pan_pred/VIDEO/*.png`, one for each frame that it was given, by name in order.
 
-A colour is a thing throughout the video, and black is none: its number is red + 256 green + 256^2 blue, as in COCO's
-panoptic pictures. Masks are of the frames' own size; there are no features.
+A colour is one instance throughout the video, and black is none: its number is red + 256 green + 256^2 blue, as in
+COCO's panoptic pictures. Masks are of the frames' own size; there are no features.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from list3r.reconstruction.precomputed_files import Piece
 
 
 class EntityMasks:
-    """Things of frames by their numbers."""
+    """Instances of frames by their numbers."""
 
     def __init__(self, folder: Path, every: int = 1) -> None:
         """Raises `SourceError` for a folder without pictures."""
@@ -36,7 +36,7 @@ class EntityMasks:
         return replace(piece, masks=np.stack(masks))
 
     def _masks(self, frame: int) -> NDArray[np.int32]:
-        """Things of a frame, numbered from 1 in the order in which they came. Shape (H, W)."""
+        """Instances of a frame, numbered from 1 in order of appearance. Shape (H, W)."""
         position = frame // self._every
         if position >= len(self._files):
             raise SourceError(f"{self._folder} has masks of {len(self._files)} frames, none of frame {frame}")

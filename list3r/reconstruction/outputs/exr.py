@@ -24,7 +24,7 @@ _MOST_BYTES, _MOST_SIDE = 2**28, 2**14
 
 
 def read_exr(path: Path) -> NDArray[np.float32]:
-    """Return the one channel of an image. Shape (h, w). Raises `OptionError` for what is none, or damaged."""
+    """Return the one channel of an image. Shape (h, w). Raises `OptionError` for an invalid or damaged file."""
     try:
         return _read(read_file(path, _MOST_BYTES))
     except (ValueError, IndexError, struct.error, zlib.error, KeyError, UnicodeDecodeError) as error:
@@ -69,7 +69,7 @@ def _header(data: bytes) -> tuple[dict[str, bytes], int]:
 
 
 def _channel(said: bytes) -> str:
-    """Return the kind of numbers of the only channel."""
+    """Return the type of the only channel."""
     end = said.index(b"\0")
     kind, _, across, down = struct.unpack_from("<iIii", said, end + 1)
     if said[end + 17 :] != b"\0" or (across, down) != (1, 1):
@@ -78,7 +78,7 @@ def _channel(said: bytes) -> str:
 
 
 def _unpacked(block: bytes, wanted: int) -> bytes:
-    """Undo zlib, differences of neighbouring bytes, and the parting of even and odd ones."""
+    """Undo zlib, differences of neighbouring bytes, and the separation of even and odd ones."""
     packed = zlib.decompressobj().decompress(block, wanted)
     if len(packed) != wanted:
         raise ValueError(f"a block has {len(packed)} bytes where {wanted} are needed")

@@ -1,4 +1,4 @@
-"""The programs whose output is read, and the folder of `precomputed` that is made of it."""
+"""The programs whose output is read, and its conversion to a folder of `precomputed`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ READERS: tuple[OutputReader, ...] = (ArraysReader(), ChunksReader(), Cut3rReader
 
 
 def convert_predictions(path: Path, folder: Path, options: OutputOptions | None = None) -> int:
-    """Write the folder of `precomputed` from what a program saved; the number of frames, each counted once.
+    """Write the folder of `precomputed` from a program's saved output; the number of frames, each counted once.
 
-    Raises `SourceError` for what is no such output, `OptionError` for a damaged one, `ExportError` for a folder that
+    Raises `SourceError` for no such output, `OptionError` for a damaged one, `ExportError` for a folder that
     exists or cannot be written.
     """
     reader = next((r for r in READERS if r.recognises(path)), None)

@@ -1,8 +1,8 @@
 """The folder that Scal3R writes: `mat.txt`, `intri.yml` and `depths/`.
 
-A row of `mat.txt` is a camera to world matrix of 16 numbers with OpenCV axes, whose rotation carries the scale of its
-block; `depths/N.exr` is z, already at the world's scale. `intri.yml` has `K_N`, px from the corner of the picture
-that its principal point is the middle of. Nothing says how sure a depth is, so all count alike.
+A row of `mat.txt` is a camera to world matrix of 16 numbers with OpenCV axes, whose rotation is scaled by the scale of
+its block; `depths/N.exr` is z, already at the world's scale. `intri.yml` has `K_N`, px from the corner of the picture
+of which its principal point is the middle. Depth has no confidence, so all pixels count alike.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _NUMBER = r"[-+0-9.eE]+"
 
 
 class Scal3rReader:
-    """What Scal3R saved."""
+    """The saved output of Scal3R."""
 
     name = "the result folder of Scal3R (mat.txt, intri.yml, depths)"
 
     def recognises(self, path: Path) -> bool:
-        """Tell whether a folder has the three."""
+        """Return whether a folder has the three."""
         return (path / "mat.txt").is_file() and (path / "intri.yml").is_file() and (path / "depths").is_dir()
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return what was saved. Raises `SourceError` and `OptionError`."""
+        """Return the saved output. Raises `SourceError` and `OptionError`."""
         T, K = _poses(path / "mat.txt"), _intrinsics(path / "intri.yml")
         if len(T) != len(K):
             raise SourceError(f"{path}: mat.txt has {len(T)} poses, intri.yml {len(K)} cameras")

@@ -20,7 +20,7 @@ def depth_confidence(
 ) -> NDArray[np.float16]:
     """Confidence in [0, 1] of each pixel, 0 where depth is unknown. Shape (H, W).
 
-    `cosine` is what `cosines` says of the depth at a small size, where that is known already.
+    `cosine` is the result of `cosines` for the depth at a small size, where that is known already.
     """
     window, noise = np.ones((3, 3), np.uint8), settings.noise
     lowest = cv2.erode(np.where(depth > 0, depth, np.float32(_BEYOND)), window)
@@ -35,10 +35,10 @@ def depth_confidence(
 def _confidence(
     depth: Floats, relief: Floats, facing: Floats, law: tuple[float, float, float, float], edge: tuple[float, float]
 ) -> Floats:
-    """Confidence of each pixel, by its depth, how much depth differs beside it, and how it is faced. Shape (H, W).
+    """Confidence of each pixel, by its depth, its depth step, and its viewing angle. Shape (H, W).
 
-    `law` is that of `SensorNoise` and the noise at which confidence is one half, metres; `edge` the relief of an edge,
-    as a share of depth, and the factor there.
+    `law` is that of `SensorNoise` and the noise at which confidence is one half, metres; `edge` the depth step of an
+    edge, as a share of depth, and the factor there.
     """
     out = np.zeros(depth.shape, np.float32)
     for row in range(depth.shape[0]):
@@ -62,7 +62,7 @@ def _facing(cosine: Floats, camera: Camera, settings: ConfidenceSettings) -> Flo
     return np.asarray(cv2.resize(factor, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def beside_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
+def next_to_edge(depth: Floats, known: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
     """Pixels next to a jump of depth by more than a share `step` of it. Shape (H, W)."""
     window = np.ones((3, 3), np.uint8)
     highest = cv2.dilate(depth, window)

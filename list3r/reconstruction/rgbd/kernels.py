@@ -1,4 +1,4 @@
-"""The loops of `registration` and `surfels`. Images have the shape (h, w), intrinsics are (fx, fy, cx, cy)."""
+"""The loops of `frame_registration` and `surfels`. Images have the shape (h, w), intrinsics are (fx, fy, cx, cy)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def pair_up(
     gate_m: float,
     agreement: float,
 ) -> Paired:
-    """How many model points meet any surface of a view, and those that meet one within the gate, M of them.
+    """Return the number of model points that meet any surface of a view, and the M pairs within the gate.
 
     `model` is points and normals (N, 3) and grey values (N,); `view` points and normals (h, w, 3) in its camera, where
-    they are known, and the inverse of the noise of depth. Returned of each pair are the view's point in model
-    coordinates (M, 3), the model's point, normal, grey value, place in the view (M, 2) and coordinates in the camera,
-    the distance from point to plane over noise (M,), and the inverse of that noise.
+    they are known, and the inverse of the noise of depth. Of each pair are returned the view's point in model
+    coordinates (M, 3), the model's point, normal, grey value, position in the view (M, 2) and coordinates in the
+    camera, the distance from point to plane over noise (M,), and the inverse of that noise.
     """
     points, normals, gray = model
     there, facing, valid, inverse_sigma = view
@@ -249,10 +249,10 @@ def fuse(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Average measurements into elements (N, 8) of point, normal, grey and weight, in place.
 
-    `element` is which of them each of M measurements meets, -1 for none; `seen` are the measurements as rows like the
-    elements (M, 8), their depth and its noise (M,); `axis` is where the camera looks. `limits` are the least cosine of
-    normals and the most views to remember. Returned is which measurements are of something new, and which elements were
-    seen through, whose weight is halved.
+    `element` is the element that each of M measurements meets, -1 for none; `seen` are the measurements as rows like
+    the elements (M, 8), their depth and its noise (M,); `axis` is the viewing direction. `limits` are the least cosine
+    of normals and the most views to remember. Returned are the measurements without an element, and the elements that
+    were seen through, whose weight is halved.
     """
     rows, depth, sigma = seen
     new, through = np.zeros(len(rows), np.bool_), np.zeros(len(elements), np.bool_)

@@ -1,10 +1,10 @@
-"""Follow the camera through a chunk: every frame is registered to the model that the frames before it made.
+"""Track the camera through a chunk: every frame is registered to the model of the frames before it.
 
-A frame is accepted only when enough of the model is seen, agrees in depth and brightness, the pairs determine every
-motion, and the motion is possible. A frame that fails, that has no known motion before it, or that agrees much less
-than its forerunners is sought by local features and by starts all round the last pose; where that fails too a new
-segment begins. Segments are joined afterwards by verified geometry only (research/depth-odometry 0062). What moves
-before the camera is left out (research/depth-odometry 0063).
+A frame is accepted only when enough of the model is seen, agrees in depth and brightness, the pairs constrain all six
+degrees of freedom, and the motion is possible. A frame that fails, that has no known motion before it, or that agrees
+much less than its forerunners is searched by local features and by starts around the last pose; where that fails too a
+new segment begins. Segments are joined afterwards by verified geometry only (research/depth-odometry 0062). Movers are
+left out (research/depth-odometry 0063).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from list3r.frames.base import Camera, Frame
 from list3r.frames.deferred import LazyFrame
 from list3r.reconstruction.features.local import Features, detect, match, relative_pose
 from list3r.reconstruction.motion.residuals import Mask, MoverMemory, fit, mover_in_residuals, without
+from list3r.reconstruction.pose_prior import given_step
 from list3r.reconstruction.poses import angle_deg, shows_more
-from list3r.reconstruction.prior import given_step
-from list3r.reconstruction.rgbd.registration import FrameRegistration, PosePrior, Samples, register
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, PosePrior, Samples, register
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame, cosines, make_view
@@ -32,7 +32,7 @@ Pose = NDArray[np.float64]
 
 @dataclass(eq=False)
 class TrackedSegment:
-    """Consecutive frames that were followed without a break, in the coordinates of the first."""
+    """Consecutive frames that were tracked without a break, in the coordinates of the first."""
 
     model: SurfelModel
     T_segment_cam: dict[int, Pose] = field(default_factory=dict)
@@ -40,27 +40,27 @@ class TrackedSegment:
     keyframes: list[int] = field(default_factory=list)
     """Positions."""
     usual_inliers: float = 0.0
-    """Share of inliers that the last frames had."""
+    """Share of inliers of the last frames."""
     usual_agreement: float = 0.0
-    """That share times how much brightness was alike, see `_alike`."""
+    """That share times the brightness agreement, see `_alike`."""
 
 
 def _alike(found: FrameRegistration) -> float:
-    """Return how much brightness is alike, 0 to 1; 1 without texture."""
+    """Return the agreement of brightness, 0 to 1; 1 without texture."""
     return 1.0 if np.isnan(found.correlation) else max(found.correlation, 0.0)
 
 
 def _explained(found: FrameRegistration) -> float:
-    """Return how much of the model a registration explains, in depth and brightness."""
+    """Return the share of the model that a registration explains, in depth and brightness."""
     return found.overlap * found.inliers * _alike(found)
 
 
-class _LookCloserError(Exception):
-    """A frame is not found from the last one that was followed: those between are needed."""
+class _SkippedFramesNeededError(Exception):
+    """A frame is not found from the last tracked one: the skipped frames between are needed."""
 
 
 class CameraTracker:
-    """Follows one chunk. `segments` holds the outcome, in order of time."""
+    """Tracks one chunk. `segments` holds the outcome, in order of time."""
 
     def __init__(
         self,
@@ -72,18 +72,18 @@ class CameraTracker:
         prior: bool = False,
         between: Collection[int] = (),
     ) -> None:
-        """`known` are masks of any size, by position, of what is known to move: the camera is followed without it.
+        """`known` are masks of any size, by position, of known movers, which are left out.
 
-        With `prior` the frames' own poses say roughly how the camera moves. Frames at the positions `between` are
-        passed over where the next one that is not among them is found without them.
+        With `prior` the frames' own poses predict the camera's motion. Frames at the positions `between` are skipped
+        where the next other frame is found without them.
         """
         self.frames, self.camera, self.settings = frames, camera, settings
         self.small = camera.shrunk(settings.working_width)
         self.segments: list[TrackedSegment] = []
         self.passed: list[list[int]] = []
-        """Positions of frames that were not looked at, in runs between two that were."""
+        """Positions of frames that were skipped, in runs between two that were not."""
         self.cosines: dict[int, Floats] = {}
-        """How the surfaces of each frame with depth are faced, by position. Shape (h, w) each."""
+        """Cosine of the viewing angle of each frame with depth, by position. Shape (h, w) each."""
         self._prior, self._between = prior, frozenset(between)
         self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
@@ -100,14 +100,14 @@ class CameraTracker:
         }
 
     def run(self) -> list[TrackedSegment]:
-        """Follow all frames, then join the segments that can be joined; the largest comes first."""
+        """Track all frames, then join the segments that can be joined; the largest comes first."""
         for position in range(len(self.frames)):
             if position in self._between and self.segments:
                 self._waiting.append(position)
                 continue
             try:
                 self._step(position)
-            except _LookCloserError:
+            except _SkippedFramesNeededError:
                 self._step_all([*self._take_waiting(), position])
             if self._waiting:
                 self.passed.append(self._take_waiting())
@@ -126,7 +126,7 @@ class CameraTracker:
                 frame.let_go()
 
     def view(self, position: int) -> WorkingFrame:
-        """Return the frame at working resolution, without what moves of its own."""
+        """Return the frame at working resolution, without its movers."""
         view = self._whole_view(position)
         return without(view, self._mover_masks[position]) if position in self._mover_masks else view
 
@@ -142,7 +142,7 @@ class CameraTracker:
 
     @property
     def mover_masks(self) -> dict[int, Mask]:
-        """What was left out of each frame as moving of its own, by position, at working resolution."""
+        """Movers that were left out of each frame, by position, at working resolution."""
         return {position: mask for position, mask in sorted(self._mover_masks.items()) if mask.any()}
 
     def features(self, position: int) -> Features:
@@ -173,7 +173,7 @@ class CameraTracker:
         self._accept(self.segments[-1], position, np.eye(4))
 
     def _open_segments(self) -> list[TrackedSegment]:
-        """Return the last segment, and the longest one while the last may be no more than a few spoilt frames."""
+        """Return the last segment, and the longest one while the last may be only a few bad frames."""
         last = self.segments[-1:]
         longest = max(self.segments, key=lambda s: len(s.T_segment_cam), default=None)
         short = bool(last) and len(last[0].T_segment_cam) < self.settings.short_segment
@@ -197,7 +197,7 @@ class CameraTracker:
             self._mover_masks[position] = mask
 
     def _keep_movers(self, segment: TrackedSegment, position: int, T_segment_cam: Pose) -> None:
-        """Take what moves out of the model, and carry it on to the next frame until it stands still."""
+        """Remove movers from the model, and propagate them to the next frame until they are static."""
         view, mask = self._whole_view(position), self._mover_masks[position]
         samples = segment.model.samples(T_segment_cam, self.small, self.settings.sweep_samples)
         usual = fit(samples, view, mask, T_segment_cam, self.settings.movers, self.settings.noise).outside
@@ -212,7 +212,7 @@ class CameraTracker:
         return shows_more(step, self.view(position).middle_depth, self.settings.keyframes)
 
     def _follow(self, segment: TrackedSegment, position: int) -> Pose | None:
-        """Return the frame's pose in the segment, or None when nothing trustworthy is found."""
+        """Return the frame's pose in the segment, or None without a reliable one."""
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
         found: list[FrameRegistration | None] = []
@@ -240,7 +240,7 @@ class CameraTracker:
         possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
         if given is not None and possible:
             possible = [f for f in possible if self._believed(segment, given, f)]
-            if not possible:  # the stated step alone, of a frame that shows something else: not for the model
+            if not possible:  # the given step alone, of a frame that shows something else: not for the model
                 self._unsure.add(position)
         if not possible:
             return None if given is None else given.T_model_cam
@@ -250,9 +250,9 @@ class CameraTracker:
         return best.T_model_cam
 
     def _believed(self, segment: TrackedSegment, given: PosePrior, found: FrameRegistration) -> bool:
-        """Return whether a pose is near the stated step, or fits so well that the given poses must have jumped.
+        """Return whether a pose is near the given step, or fits so well that the given poses must have jumped.
 
-        A blurred picture of a bare floor fits somewhere else, too, if badly (0153).
+        A blurred picture of a bare floor also fits elsewhere, if badly (0153).
         """
         prior = self.settings.prior
         off = np.linalg.inv(given.T_model_cam) @ found.T_model_cam
@@ -267,7 +267,7 @@ class CameraTracker:
         return found is None or found.inliers * _alike(found) < self.settings.doubt * segment.usual_agreement
 
     def _given(self, segment: TrackedSegment, last: int, position: int, gap_s: float) -> PosePrior | None:
-        """Where the source's own poses put the frame; None where they say nothing or a motion that cannot be."""
+        """The frame's pose by the source's own poses; None where these are missing or the motion is impossible."""
         s = self.settings
         step = given_step(self.frames[last].T_source_cam, self.frames[position].T_source_cam) if self._prior else None
         if step is None or angle_deg(step) > s.most_turn_deg_per_s * gap_s:
@@ -303,7 +303,7 @@ class CameraTracker:
         blind: bool = False,
         prior: PosePrior | None = None,
     ) -> FrameRegistration | None:
-        """Register the frame to the segment's model from a guess, kept only when it can be trusted."""
+        """Register the frame to the segment's model from a guess, kept only when it is reliable."""
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         s, view = self.settings, self.view(position)
         found = register(samples, view, T_guess, s.registration, s.noise, prior)
@@ -315,7 +315,7 @@ class CameraTracker:
         return found if found is not None and self._trusted(found, samples, position, blind) else None
 
     def _trusted(self, found: FrameRegistration, samples: Samples, position: int, blind: bool) -> bool:
-        """Return whether a registration can be believed; one from a blind guess must agree in brightness as well."""
+        """Return whether a registration is reliable; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
         share = view.known_share
         agrees = found.correlation >= s.least_correlation if blind else not found.correlation < s.least_correlation
@@ -341,13 +341,13 @@ class CameraTracker:
     def _search(
         self, segment: TrackedSegment, position: int, nearby: bool, frugal: bool = False
     ) -> FrameRegistration | None:
-        """Find the frame without a guess: by features, and by starts all round the last pose where it is `nearby`.
+        """Find the frame without a guess: by features, and by starts around the last pose where it is `nearby`.
 
-        A `frugal` search takes the first place by features that leaves no doubt. Raises `_LookCloserError` where frames
-        before it were passed over.
+        A `frugal` search takes the first unambiguous place by features. Raises `_SkippedFramesNeededError` where frames
+        before it were skipped.
         """
         if self._waiting:
-            raise _LookCloserError
+            raise _SkippedFramesNeededError
         last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
@@ -358,14 +358,14 @@ class CameraTracker:
             placed.append(self._place(segment, position, T))
             if not self._doubtful(segment, placed[-1]) and self._possible(segment, last, placed[-1], gap_s):
                 return placed[-1]
-        left = list(starts)  # before any is placed, which takes what moves out of the frame
+        left = list(starts)  # before any is placed, which removes movers from the frame
         blind = self._sweep(segment, last, position) if nearby else []
         placed += [self._place(segment, position, T) for T in left]
         placed += [self._place(segment, position, T, blind=True) for T in blind]
         return max((p for p in placed if p is not None), key=_explained, default=None)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
-        """The best of several coarse registrations, started from motions that a slow video makes between frames."""
+        """The best of several coarse registrations, started from the usual motions between frames of a slow video."""
         view, T_last = self.view(position), segment.T_segment_cam[last]
         far = view.middle_depth
         samples = segment.model.samples(T_last, self.small, self.settings.sweep_samples)
@@ -402,7 +402,7 @@ class CameraTracker:
         return None
 
     def _attach(self, base: TrackedSegment, other: TrackedSegment) -> bool:
-        """Add a segment to another where the two can be related; whether that was done."""
+        """Add a segment to another where the two can be related; returns whether it was."""
         T_base_other = self._connect(base, other)
         if T_base_other is None:
             return False

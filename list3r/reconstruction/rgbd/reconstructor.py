@@ -1,7 +1,7 @@
 """Reconstruction `rgbd`: sensor depth with poses that are given or estimated.
 
 Estimated poses come from dense registration of each frame to a model of surface elements, depth and brightness
-together (`odometry`, `registration`, `surfels`); local features find frames again after a break (`features`).
+together (`odometry`, `frame_registration`, `surfels`); local features find frames again after a break (`features`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from list3r.memory.errors import OptionError, TrackingError
 from list3r.reconstruction.base import PosedOnly, Reconstruction
 from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
 from list3r.reconstruction.motion.tracks import track_movers
+from list3r.reconstruction.pose_prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.poses import given_poses, select_keyframes
-from list3r.reconstruction.prior import bridged, source_from_chunk, stacked
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker
@@ -62,7 +62,7 @@ class RgbdReconstructor:
     def thinned(self, frames: Sequence[Frame], camera: Camera, deep: Collection[int]) -> Reconstruction:
         """Reconstruct a chunk of which only the frames of the numbers `deep` get depth, and the others a pose.
 
-        Those others are looked at only where the camera cannot be followed without them. Raises as above.
+        The others are used only where the camera is lost without them. Raises as above.
         """
         used = [k for k, frame in enumerate(frames) if frame.index in deep]
         shown = [frames[k] for k in used]
@@ -118,7 +118,7 @@ class RgbdReconstructor:
         camera: Camera,
         hints: Mapping[int, NDArray[np.bool_]],
     ) -> NDArray[np.uint8] | None:
-        """Number what moves, see `Reconstruction.movers`."""
+        """Number the movers, see `Reconstruction.movers`."""
         small = SmallFrames.of([f.depth for f in frames], T_chunk_cam, posed, camera, self.settings.movers.width)
         masks = movers_in_free_space(small, hints, self.settings.movers)
         if masks is None:
@@ -133,9 +133,9 @@ class RgbdReconstructor:
         used: Sequence[int],
         known: Mapping[int, NDArray[np.bool_]] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[int], CameraTracker]:
-        """Poses, which frames have one, keyframes, and what followed the camera; without what `known` holds.
+        """Poses, which frames have one, keyframes, and the tracker; without the masks of `known`.
 
-        Of frames that are not `used` (positions) only those are looked at without which it cannot be followed.
+        Frames that are not `used` (positions) are looked at only where the camera is lost without them.
         """
         how = self.settings.odometry
         between = set(range(len(frames))) - set(used)
@@ -162,9 +162,9 @@ class RgbdReconstructor:
 def _pose_passed(
     T: NDArray[np.float64], posed: NDArray[np.bool_], passed: Sequence[Sequence[int]], times_s: Sequence[float]
 ) -> None:
-    """Pose frames that were passed over, in place, by a steady motion between the two frames beside each run of them.
+    """Pose skipped frames, in place, by a steady motion between the two frames around each run of them.
 
-    Where a clock stands still they lie in the middle. `T` (F, 4, 4) and `posed` (F,) are of all frames.
+    Where the time stamps are equal they are in the middle. `T` (F, 4, 4) and `posed` (F,) are of all frames.
     """
     for run in passed:
         before, after = run[0] - 1, run[-1] + 1
@@ -180,7 +180,7 @@ def _pose_passed(
 
 
 def _among(rows: Mapping[int, T_], used: Sequence[int]) -> dict[int, T_]:
-    """What is known of frames by position, of those that are used, by their place among them."""
+    """Values of the `used` frames, renumbered from their position to their rank among them."""
     return {place: rows[k] for place, k in enumerate(used) if k in rows}
 
 
@@ -189,7 +189,7 @@ def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _take_out(depth: NDArray[np.float32], movers: NDArray[np.uint8]) -> None:
-    """Make depth (F, H, W) unknown, in place, where something moves: what is left is the scene that stays."""
+    """Make depth (F, H, W) unknown, in place, on movers: the rest is the static scene."""
     height, width = depth.shape[1:]
     stride = -(-width // movers.shape[2])
     for position in np.flatnonzero(movers.any(axis=(1, 2))).tolist():

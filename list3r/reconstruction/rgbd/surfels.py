@@ -1,7 +1,7 @@
 """A model of surface elements that grows and sharpens as views are fused into it.
 
-Surface elements instead of a volume: no resolution or extent to choose, and cost follows what is seen (Keller et al.,
-"Real-time 3D reconstruction in dynamic scenes using point-based fusion", 2013).
+Surface elements instead of a volume: no resolution or extent to choose, and cost grows with the visible surface (Keller
+et al., "Real-time 3D reconstruction in dynamic scenes using point-based fusion", 2013).
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.rgbd.frame_registration import Samples
 from list3r.reconstruction.rgbd.kernels import foremost, fuse
-from list3r.reconstruction.rgbd.registration import Samples
 from list3r.reconstruction.rgbd.settings import SurfelSettings
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame
 
@@ -48,7 +48,7 @@ class SurfelModel:
         return Samples(points, normals, gray)
 
     def fuse(self, view: WorkingFrame, T_model_cam: NDArray[np.float64]) -> None:
-        """Average the view into the elements that it agrees with, add what is new, weaken what it sees through."""
+        """Average the view into the elements that it agrees with, add new ones, weaken those that it sees through."""
         pixel = np.flatnonzero(view.valid)
         R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
         local = view.points.reshape(-1, 3)[pixel]

@@ -44,7 +44,7 @@ class WorkingFrame:
 
     @cached_property
     def middle_depth(self) -> float:
-        """Median of the depth that is known, metres."""
+        """Median of the known depth, metres."""
         return float(np.median(self.depth[self.depth > 0]))
 
 
@@ -62,7 +62,7 @@ def pixel_rays(camera: Camera) -> Floats:
 
 
 def shrink_depth(depth: Floats, camera: Camera, noise: SensorNoise) -> Floats:
-    """Depth averaged over blocks; 0 where a block lies across an edge or is mostly unknown. Shape (h, w).
+    """Depth averaged over blocks; 0 where a block is across an edge or is mostly unknown. Shape (h, w).
 
     A block of a plane seen at a slope s spreads by s * footprint / sqrt(12); more spread than the steepest slope
     gives, plus noise, is an edge.
@@ -99,7 +99,7 @@ def cosines(points: Floats, normals: Floats, valid: NDArray[np.bool_]) -> Floats
 
 @compiled
 def _surface(depth: Floats, rays: Floats, valid: NDArray[np.bool_], steepest: float) -> tuple[Floats, Floats]:
-    """Points and unit normals of a depth image; `valid` is taken back, in place, where depth is too steep."""
+    """Points and unit normals of a depth image; `valid` is cleared, in place, where depth is too steep."""
     points, normals = np.empty(rays.shape, np.float32), np.zeros(rays.shape, np.float32)
     height, width = depth.shape
     for row in range(height):
@@ -150,8 +150,8 @@ def make_view(color: NDArray[np.uint8], depth: Floats, camera: Camera, noise: Se
 
 
 def tones(gray: NDArray[Any]) -> Floats:
-    """Return brightness on a logarithmic scale, to which another exposure adds the same everywhere. Shape (h, w).
+    """Return brightness on a logarithmic scale, to which another exposure adds a constant. Shape (h, w).
 
-    Its unit is a grey level at middle grey; below `_DARK` grey levels noise is most of what differs.
+    Its unit is a grey level at middle grey; below `_DARK` grey levels most differences are noise.
     """
     return np.asarray(_SCALE * np.log1p(gray.astype(np.float32) / _DARK), np.float32)

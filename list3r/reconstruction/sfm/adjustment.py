@@ -29,11 +29,11 @@ Poses = NDArray[np.float64]
 def adjust(
     problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], settings: AdjustmentSettings
 ) -> SparseMap | None:
-    """Views with their poses adjusted, in the frame of reference and scale of those given; None where too little ties
-    them.
+    """Views with their poses adjusted, in the frame of reference and scale of the given ones; None for too few
+    correspondences.
 
-    All views of the problem must have a pose. Views that see too few points are left out. What is left of the lens's
-    distortion is free, so that it does not bend the map.
+    All views of the problem must have a pose. Views that see too few points are left out. The lens's residual
+    distortion is free, so that it does not deform the map.
     """
     gate = settings.gates_px[0] * pixel_unit(camera)
     cache = correspondences(problem, camera, "k1", settings.mapping, agreeing_rows(problem, camera, T_map_cam, gate))
@@ -53,7 +53,7 @@ def adjust(
 def agreeing_rows(
     problem: MapProblem, camera: Camera, T_map_cam: Mapping[int, Poses], gate_px: float
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Return the rows of each pair that lie near the epipolar lines of the poses; of pairs without poses nothing."""
+    """Return the rows of each pair near the epipolar lines of the poses; none of pairs without poses."""
     out = {}
     for (a, b), rows in problem.pairs.items():
         if a not in T_map_cam or b not in T_map_cam:
@@ -64,7 +64,7 @@ def agreeing_rows(
 
 
 def _round(mapper: Any, made: Any, options: Any, iterations: int, loss_px: float) -> None:
-    """Triangulate what is within the gate of the options, adjust, and leave out what is not any more."""
+    """Triangulate within the gate of the options, adjust, and leave out points beyond it."""
     gate_px = options.mapper.filter_max_reproj_error
     focal = float(next(iter(made.cameras.values())).params[0])
     triangulation = options.triangulation

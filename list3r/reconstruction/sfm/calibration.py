@@ -1,8 +1,7 @@
 """Estimate the lens of an RGB source once before its chunks: focal length and radial distortion.
 
 Windows spread over the video are mapped each by itself with a free camera, and then adjusted together with one camera
-for all. A window's parallax decides how much it says. All chunks use the camera that was found (research/colour-video
-0069).
+for all. A window is weighted by its parallax. All chunks use the estimated camera (research/colour-video 0069).
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from list3r.reconstruction.sfm.tracks import CornerTracks, follow_corners
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """What was found of a source's camera."""
+    """The estimated camera of a source."""
 
     camera: Camera
-    """With the distortion of the pictures as they are handed out."""
+    """With the distortion of the pictures as they are delivered."""
     windows: int
-    """Windows that it stands on; 0 where none could be mapped and the camera is as it was."""
+    """Windows that support it; 0 where none could be mapped and the camera is unchanged."""
     focal_px: float | None
-    """Focal length by the pictures alone, None where they did not tell."""
+    """Focal length by the pictures alone, None where it could not be estimated."""
     notes: tuple[str, ...] = ()
-    """What the user should know, one sentence each."""
+    """Warnings for the user, one sentence each."""
 
 
 def calibrate(
@@ -45,8 +44,8 @@ def calibrate(
 ) -> CameraCalibration:
     """Estimate the camera of a source: all of it where it is unknown, the distortion where the rest is given.
 
-    `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes speak of those.
-    `mapped` maps the windows somewhere else, as in other processes, in the way of `map_window`.
+    `stored_px` is how many px of the pictures as stored one px of the source's frames is; notes use the former.
+    `mapped` maps the windows elsewhere, as in other processes, with the result of `map_window`.
     """
     sfm = settings or SfmSettings()
     chosen = sfm.calibration
@@ -71,7 +70,7 @@ def calibrate(
 def calibrate_by_map(
     start: Camera, keyframes: tuple[MapProblem, SparseMap], settings: SfmSettings, stored_px: float = 1.0
 ) -> CameraCalibration:
-    """Estimate what is not known of a camera whose focal length is given, from some keyframes of a map of the video."""
+    """Estimate the unknown parts of a camera of given focal length, from some keyframes of a map of the video."""
     free, _ = _adjust_together([keyframes], start, True, settings.calibration)
     return _of_known([keyframes], (start, free), settings.calibration, stored_px)
 
@@ -83,7 +82,7 @@ def _of_known(
     stored_px: float,
     notes: tuple[str, ...] = (),
 ) -> CameraCalibration:
-    """Return the lens of a camera as given, or a doubt about it where the camera by the pictures alone is another."""
+    """Return the lens of a camera as given, or a warning where the pictures alone suggest another camera."""
     start, free = cameras
     sigma = _focal_sigma(windows, settings)
     if abs(np.log(free.fx / start.fx)) > settings.doubted_sigmas * sigma:
@@ -103,21 +102,21 @@ def _px_text(camera: Camera, sigma: float, stored_px: float) -> str:
 
 _Windows = list[tuple[MapProblem, SparseMap]]
 WindowMaps = Callable[[Sequence[tuple[int, int]], Camera], Iterable[tuple[MapProblem, SparseMap] | None]]
-"""What maps windows, by their positions [start, stop), each from a camera to begin with."""
+"""Maps windows, by their positions [start, stop), each from an initial camera."""
 Progress = Callable[[int, int], None]
 """Called with (windows done, in all)."""
 
 
 @dataclass(frozen=True)
 class _Estimate:
-    """What the windows of a video say."""
+    """The estimates of a video's windows."""
 
     windows: _Windows
-    """Those that agree, from which the camera is."""
+    """The windows that agree, from which the camera is."""
     camera: Camera
     k1: float
     others: tuple[tuple[int, float, float], ...]
-    """Frame.index at which windows begin that can be believed and say something else; their focal length, px; k1."""
+    """Frame.index at which plausible windows begin that disagree; their focal length, px; k1."""
     frames: int
     """Length of a window."""
 
@@ -129,7 +128,7 @@ def _estimated(
     mapped: WindowMaps,
     progress: Progress | None,
 ) -> _Estimate | None:
-    """Return what is said by the windows that could be mapped and can be believed; None where they make no sense."""
+    """Return the estimate of the plausible windows among those mapped; None where they make no sense."""
     windows, begins, spans = [], [], _spans(source.info.frame_count, settings)
     for done, window in enumerate(mapped(spans, start), start=1):
         if window is not None and _believable(window[1].camera, window[1].k1, settings):
@@ -149,14 +148,14 @@ def _estimated(
 
 
 def _believable(camera: Camera, k1: float, settings: CameraCalibrationSettings) -> bool:
-    """Return whether a camera has such a lens."""
+    """Return whether a lens of such a camera exists."""
     share = camera.fx / max(camera.width, camera.height)
     (short, long), (least, most) = settings.focal_range, settings.distortion_range
     return short < share < long and least <= k1 <= most
 
 
 def _agreeing(focals: NDArray[np.float64], settings: CameraCalibrationSettings) -> NDArray[np.bool_]:
-    """Windows that are near the middle of all; where fewer than half are, those near the one with most around it."""
+    """Windows near the median of all; where fewer than half are, those near the one with most around it."""
     logs = np.log(focals)
     near = np.abs(logs[:, None] - np.r_[np.median(logs), logs][None]) < np.log(settings.most_window_ratio)
     votes = near.sum(axis=0)
@@ -164,7 +163,7 @@ def _agreeing(focals: NDArray[np.float64], settings: CameraCalibrationSettings) 
 
 
 def _parted(found: _Estimate, stored_px: float, settings: CameraCalibrationSettings) -> tuple[str, ...]:
-    """Return what is said where windows that can be believed tell clearly different focal lengths."""
+    """Return the warning for plausible windows of clearly different focal lengths."""
     if found.frames < settings.frames:
         return ()
     far = [
@@ -211,7 +210,7 @@ def _spans(count: int, settings: CameraCalibrationSettings) -> list[tuple[int, i
 def map_window(
     source: FrameSource, start: int, stop: int, camera: Camera, settings: SfmSettings
 ) -> tuple[MapProblem, SparseMap] | None:
-    """Return the largest map of the frames at positions [start, stop), with a camera of its own; None without one."""
+    """Return the largest map of the frames at positions [start, stop), with its own camera; None without one."""
     frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
     if len(frames) < 2:
         return None
@@ -225,8 +224,8 @@ def map_window(
 
 
 def _longest_run(tracks: CornerTracks) -> CornerTracks:
-    """The tracks with the keyframes of their longest run alone, where it has half of the frames: what a jump or a wall
-    parts from it would be tied by features and says nothing more of the lens."""
+    """The tracks with the keyframes of their longest run alone, where it has half of the frames: other runs would be
+    joined by features over a jump or a wall and add nothing on the lens."""
     followed = tracks.run[tracks.run >= 0]
     longest = int(np.bincount(followed).argmax()) if len(followed) else -1
     if 2 * int((tracks.run == longest).sum()) < len(tracks.run):
@@ -258,7 +257,7 @@ def _adjust_together(
     for image_id in made.reg_image_ids():
         config.add_image(image_id)
     for left in reversed(range(settings.rounds)):
-        solver.solver_options.function_tolerance = settings.early_settled if left else settings.settled
+        solver.solver_options.function_tolerance = settings.early_tolerance if left else settings.tolerance
         pycolmap.create_default_bundle_adjuster(options, config, made).solve()
         pycolmap.ObservationManager(made).filter_points3D_with_large_reprojection_error(
             settings.most_error_px, set(made.points3D), pycolmap.ReprojectionErrorType.PIXEL

@@ -1,6 +1,6 @@
 """pycolmap, kept quiet, and our cameras and poses in its terms.
 
-Loading it hands the signal that ends a process to its logger, which prints a native stack.
+Loading it assigns the termination signal to its logger, which prints a native stack.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def pixel_unit(camera: Camera) -> float:
 
 
 def matrix_of(rigid: Any) -> NDArray[np.float64]:
-    """Return the pose that a `Rigid3d` is. Shape (4, 4)."""
+    """Return the pose of a `Rigid3d`. Shape (4, 4)."""
     T = np.eye(4)
     T[:3] = rigid.matrix()
     return T

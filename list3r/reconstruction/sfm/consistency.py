@@ -1,8 +1,8 @@
-"""Whether the keyframes of a map stand where their matches say.
+"""Whether the poses of a map's keyframes agree with their matches.
 
 Growing a map adds a keyframe when a few dozen of its points fit a pose; matches with other keyframes that contradict it
-are then dropped. Here they are asked again: of what verified two-view geometry relates, most must lie on the epipolar
-lines that the map's poses give (research/colour-video 0065).
+are then dropped. Here they are tested again: most verified two-view matches must be near the epipolar lines of the
+map's poses (research/colour-video 0065).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from list3r.reconstruction.sfm.settings import ConsistencySettings
 
 Floats = NDArray[np.float64]
 Seen = Mapping[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""Where verified matches are seen in two keyframes, px, by keys. Shapes (M, 2)."""
+"""Pixels of verified matches in two keyframes, by keys. Shapes (M, 2)."""
 
 
 def contradicted(

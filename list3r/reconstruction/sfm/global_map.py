@@ -1,11 +1,11 @@
 """A map of all keyframes at once, for chunks in which a growing map can lose its scale.
 
-A map that grows keyframe by keyframe passes its scale on from one to the next. Where the camera turns on the spot it
-can slip into a local minimum: two halves that each are right, one of them larger by a tenth up to twice, which more
-adjustment does not mend (research/colour-video 0208). Global structure from motion (Pan et al., "Global
-Structure-from-Motion Revisited", ECCV 2024, as pycolmap has it) averages rotations and places all cameras and points
-together. It takes several times as long, so it is asked only where turns lose scale or a map leaves apart what shares
-matches; what explains more of the pictures is kept.
+A map that grows keyframe by keyframe passes its scale on from one to the next. Where the camera rotates in place it can
+reach a local minimum: two halves that each are right, one of them larger by a tenth up to twice, which more adjustment
+does not correct (research/colour-video 0208). Global structure from motion (Pan et al., "Global Structure-from-Motion
+Revisited", ECCV 2024, as in pycolmap) averages rotations and places all cameras and points together. It takes several
+times as long, so it is used only where rotations lose scale or a map separates keyframes that share matches; the map
+that explains more of the pictures is kept.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.base import Camera
+from list3r.reconstruction.scale_loss import lost_scale
 from list3r.reconstruction.sfm.colmap import pycolmap
 from list3r.reconstruction.sfm.mapping import (
     MapProblem,
@@ -26,11 +27,10 @@ from list3r.reconstruction.sfm.mapping import (
     adjusted,
     database_of,
     sparse_map,
-    without_beside,
+    without_context,
 )
+from list3r.reconstruction.sfm.pure_rotation import only_turns
 from list3r.reconstruction.sfm.settings import MappingSettings
-from list3r.reconstruction.sfm.turning import only_turns
-from list3r.reconstruction.turns import lost_scale
 
 
 def with_global_map(
@@ -38,9 +38,8 @@ def with_global_map(
 ) -> list[SparseMap]:
     """Return maps that grew from the keyframes of a problem, the largest first.
 
-    Where turns may have lost their scale, or they leave apart what shares matches, they are adjusted once more with
-    points made anew, or a global map that explains as much of what was seen takes their place. `verified` is as for
-    `correspondences`.
+    Where rotations may have lost their scale, or they separate keyframes with matches, they are adjusted once more with
+    new points, or replaced by a global map that explains as many observations. `verified` is as for `correspondences`.
     """
     if not maps or settings.turned_scale <= 0.0:
         return list(maps)
@@ -58,21 +57,21 @@ def with_global_map(
 
 
 def _left_apart(maps: Sequence[SparseMap], problem: MapProblem, settings: MappingSettings, pairs: Matches) -> bool:
-    """Return whether a keyframe shares enough matches with one that is in another map, or in none."""
+    """Return whether a keyframe shares enough matches with one in another map, or in none."""
     of = {key: n for n, m in enumerate(maps) for key in m.T_map_cam}
     return any(
-        len(rows) >= settings.least_matches and of.get(a) != of.get(b) and not {a, b} & problem.beside
+        len(rows) >= settings.least_matches and of.get(a) != of.get(b) and not {a, b} & problem.context
         for (a, b), rows in pairs.items()
     )
 
 
 def _explained(found: SparseMap) -> int:
-    """Return how many observations of its keyframes a map explains."""
+    """Return the number of its keyframes' observations that a map explains."""
     return sum(len(view.ids) for view in found.seen.values())
 
 
 def scale_lost_at_turns(found: SparseMap, steps: int = 10) -> float:
-    """Return the deviation of the logarithm of scale over the worst so many steps from keyframe to keyframe."""
+    """Return the deviation of the log scale over the worst that many steps from keyframe to keyframe."""
     keys = sorted(found.T_map_cam)
     T = np.stack([found.T_map_cam[key] for key in keys])
     seen = [np.array([found.points[n] for n in found.seen[key].ids.tolist()]).reshape(-1, 3) for key in keys]
@@ -87,7 +86,7 @@ def scale_lost_at_turns(found: SparseMap, steps: int = 10) -> float:
 def global_map(
     problem: MapProblem, camera: Camera, settings: MappingSettings, verified: Matches | None
 ) -> SparseMap | None:
-    """Return the largest map that all keyframes give at once; None where there is none, or the camera only turns."""
+    """Return the largest map of all keyframes at once; None without one, or where the camera only rotates."""
     database = database_of(problem, camera, "", settings, None)
     if database is None:
         return None
@@ -101,7 +100,7 @@ def global_map(
     if found is None:
         return None
     poses = _held(found, settings)
-    found = without_beside(replace(found, T_map_cam=poses, seen={k: found.seen[k] for k in poses}), problem)
+    found = without_context(replace(found, T_map_cam=poses, seen={k: found.seen[k] for k in poses}), problem)
     places = {key: view.xy for key, view in problem.views.items()}
     if len(found.T_map_cam) < 2 or only_turns(places, problem.pairs, found.T_map_cam, camera, settings.turning):
         return None
@@ -109,12 +108,12 @@ def global_map(
 
 
 def _held(found: SparseMap, settings: MappingSettings) -> dict[int, Poses]:
-    """Poses of the keyframes that enough of what they see holds."""
+    """Poses of the keyframes with enough observed points."""
     return {key: T for key, T in found.T_map_cam.items() if len(found.seen[key].ids) >= settings.least_matches}
 
 
 def _options(settings: MappingSettings) -> Any:
-    """Return how pycolmap makes the map: as it does by itself, but for a known camera, and the same every time."""
+    """Return pycolmap's options: its defaults, but for a known camera, and deterministic."""
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed, options.min_num_matches = 1, settings.seed, settings.least_matches
     mapper = options.mapper

@@ -17,8 +17,8 @@ def pose_equations(
     """Return the information (6, 6) and the gradient (6,) of a camera's motion in its own frame: translation, rotation
     vector.
 
-    From points (N, 3) and where they are seen (N, 2), px, those in `rows` that lie before the camera, under a Cauchy
-    kernel of `scale` px. `lens` is fx, fy, cx, cy.
+    From points (N, 3) and their pixels (N, 2), those in `rows` that are in front of the camera, under a Cauchy kernel
+    of `scale` px. `lens` is fx, fy, cx, cy.
     """
     information, gradient, slope = np.zeros((6, 6)), np.zeros(6), np.empty((2, 6))
     fx, fy, cx, cy = lens

@@ -1,6 +1,5 @@
-"""Local features of keyframes, and which keyframes are worth matching: those whose surest features already agree
-(preemptive matching; Wu, "Towards linear-time incremental structure from motion", 3DV 2013).
-"""
+"""Local features of keyframes, and which keyframes are worth matching: those whose best features already agree
+(preemptive matching; Wu, "Towards linear-time incremental structure from motion", 3DV 2013)."""
 
 from __future__ import annotations
 
@@ -23,17 +22,17 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """Features of a picture, the surest first."""
+    """Features of a picture, best first."""
 
     xy: Floats
     """px. Shape (N, 2)."""
     descriptors: Floats
     """Unit vectors. Shape (N, D)."""
     ratio: float
-    """Lowe's ratio that suits them."""
+    """Lowe's ratio for them."""
 
     def surest(self, count: int) -> LocalFeatures:
-        """Return the first so many."""
+        """Return the first features."""
         return LocalFeatures(self.xy[:count], self.descriptors[:count], self.ratio)
 
 
@@ -59,7 +58,7 @@ def make_finder(
 
 
 def sift_features(gray: NDArray[np.uint8], settings: FinderSettings) -> LocalFeatures:
-    """SIFT features of a grey picture, each place once."""
+    """SIFT features of a grey picture, one per position."""
     factor = shrinkage(gray.shape, settings.width)
     sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
     keypoints, descriptors = sift.detectAndCompute(shrunk(gray, factor), None)
@@ -74,7 +73,7 @@ def sift_features(gray: NDArray[np.uint8], settings: FinderSettings) -> LocalFea
 
 
 def match_features(a: LocalFeatures, b: LocalFeatures) -> Ints:
-    """Rows of two pictures that show the same. Shape (M, 2)."""
+    """Matching rows of two pictures. Shape (M, 2)."""
     return nearest_pairs(a.descriptors, b.descriptors, a.ratio)
 
 

@@ -1,8 +1,8 @@
-"""What keyframes of a chunk see in common: tracked corners, and local features where tracks do not reach.
+"""Matches between keyframes of a chunk: tracked corners, and local features where tracks do not reach.
 
-Corners tie keyframes of one run of tracks. Where all tracks ended at once, keyframes of all runs that look alike are
+Corners connect keyframes of one run of tracks. Where all tracks ended at once, similar keyframes of all runs are
 matched by local features. Frames before and behind the chunk are mapped with it, and all keyframes are matched by
-features as well, because corners alone bend a chunk with little motion (research/colour-video 0065).
+features as well, because corners alone deform a chunk with little motion (research/colour-video 0065).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from list3r.reconstruction.sfm.settings import LinkSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 _FEATURE_IDS = 1_000_000
-"""Numbers of features start here for the first keyframe, so that they never meet those of tracks."""
+"""First feature number of the first keyframe, above all track numbers."""
 _AHEAD_IDS = 500_000
-"""... and here those of features by which a keyframe is matched with the ones ahead."""
+"""The same for features by which a keyframe is matched with the ones ahead."""
 _NO_ROWS = np.zeros((0, 2), np.int64)
 
 
@@ -38,7 +38,7 @@ def keyframe_problem(
 
 
 def corner_problem(tracks: CornerTracks, settings: LinkSettings) -> MapProblem:
-    """Return the keyframes of a chunk with the corners that were followed alone."""
+    """Return the keyframes of a chunk with their tracked corners alone."""
     views = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     pairs = {}
     for n, a in enumerate(tracks.keyframes):
@@ -49,9 +49,9 @@ def corner_problem(tracks: CornerTracks, settings: LinkSettings) -> MapProblem:
     return MapProblem(views, pairs)
 
 
-def step_beside(tracks: CornerTracks, settings: LinkSettings) -> int:
-    """Return how many frames apart those that are mapped beside a chunk are."""
-    apart = settings.beside_step * len(tracks.run) / max(1, len(tracks.keyframes))
+def context_step(tracks: CornerTracks, settings: LinkSettings) -> int:
+    """Return the distance, in frames, of the context frames that are mapped with a chunk."""
+    apart = settings.context_step * len(tracks.run) / max(1, len(tracks.keyframes))
     return int(np.clip(round(apart), 1, settings.most_step))
 
 
@@ -87,7 +87,7 @@ def with_neighbours(
 
 
 def with_features(problem: MapProblem, finder: Finder, settings: LinkSettings) -> MapProblem:
-    """Return the problem with keyframes that look alike, and share no tracks, matched by features."""
+    """Return the problem with similar keyframes that share no tracks matched by features."""
     views, pairs = dict(problem.views), dict(problem.pairs)
     found = {key: finder(key) for key in sorted(views)}
     first = {key: len(view.ids) for key, view in views.items()}

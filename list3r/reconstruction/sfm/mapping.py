@@ -1,9 +1,9 @@
 """Structure from motion of keyframes by pycolmap: two-view geometry, incremental mapping, bundle adjustment.
 
-Nothing touches the disk: the correspondences lie in a database in memory. pycolmap's pixels have their origin at the
-corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
+Nothing is written to the disk: the correspondences are in a database in memory. pycolmap's pixels have their origin at
+the corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
 correspondences give the same structure. Growing a map is a local search, so maps are grown from pairs in up to three
-places of a chunk (research/colour-video 0064), roughly, and the one that is kept is adjusted once it is whole
+places of a chunk (research/colour-video 0064), roughly, and the kept one is adjusted once it is complete
 (research/colour-video 0181).
 """
 
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.consistency import contradicted
+from list3r.reconstruction.sfm.pure_rotation import only_turns
 from list3r.reconstruction.sfm.settings import MappingSettings
-from list3r.reconstruction.sfm.turning import only_turns
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -57,24 +57,24 @@ class SparseMap:
     error_px: float = 0.0
     """Mean reprojection error."""
     seen: dict[int, KeyframeView] = field(default_factory=dict)
-    """What each view sees of the points, by key of the view."""
+    """The points that each view sees, by key of the view."""
 
 
 Matches = Mapping[tuple[int, int], NDArray[np.int64]]
-"""Rows of two views that show the same, by the two views' keys. Shape (M, 2)."""
+"""Matching rows of two views, by the two views' keys. Shape (M, 2)."""
 
 
 @dataclass(frozen=True)
 class MapProblem:
-    """Keyframes and what they see in common."""
+    """Keyframes and their correspondences."""
 
     views: dict[int, KeyframeView]
     pairs: dict[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
-    """Rows of the views that show the same point, by keys, the smaller first. Shape (M, 2)."""
+    """Matching rows of the views, by keys, the smaller first. Shape (M, 2)."""
     matched: frozenset[tuple[int, int]] = frozenset()
-    """Pairs whose rows were not followed but matched by looks."""
-    beside: frozenset[int] = frozenset()
-    """Views that help to make the map and are no part of it afterwards."""
+    """Pairs whose rows were not tracked but matched by descriptors."""
+    context: frozenset[int] = frozenset()
+    """Views that help to make the map and are left out of it afterwards."""
 
 
 def shared_rows(a: KeyframeView, b: KeyframeView) -> NDArray[np.int64]:
@@ -91,11 +91,11 @@ def build_maps(
     settings: MappingSettings | None = None,
     verified: Matches | None = None,
 ) -> list[SparseMap]:
-    """Maps of the keyframes, the largest first; several where they cannot be joined, none where nothing has depth or
-    the camera only turns.
+    """Maps of the keyframes, the largest first; several where they cannot be joined, none without depth or where the
+    camera only rotates.
 
-    `free_camera` names what of the camera is estimated as well: "" nothing, "k1" the distortion, "focal" the focal
-    length and the distortion. `verified` is as for `correspondences`.
+    `free_camera` names the parts of the camera that are estimated as well: "" none, "k1" the distortion, "focal" the
+    focal length and the distortion. `verified` is as for `correspondences`.
     """
     chosen = settings or MappingSettings()
     cache = correspondences(problem, camera, free_camera, chosen, verified)
@@ -107,7 +107,7 @@ def build_maps(
     for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
         made = _grown(work, pair)
         maps = [found for found, _ in made]
-        own = [(without_beside(found, problem), model) for found, model in made]
+        own = [(without_context(found, problem), model) for found, model in made]
         own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
         grown.append([found for found, _ in own])
         models |= {id(found): model for found, model in own}
@@ -122,8 +122,8 @@ def build_maps(
 
 
 def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[int, int]]:
-    """Pairs of keyframes from which maps are grown besides: those that share most in the second and the last third."""
-    own = sorted(problem.views.keys() - problem.beside)
+    """Further initial pairs of keyframes: those that share most in the second and the last third."""
+    own = sorted(problem.views.keys() - problem.context)
     place = {key: n for n, key in enumerate(own)}
     least, most = settings.given_steps
     out = []
@@ -137,7 +137,7 @@ def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[in
 
 @dataclass(frozen=True)
 class _Work:
-    """What maps are grown of, and how."""
+    """Inputs of growing maps."""
 
     cache: Any
     problem: MapProblem
@@ -145,10 +145,10 @@ class _Work:
     free_camera: str
     settings: MappingSettings
     turns: dict[frozenset[int], bool] = field(default_factory=dict)
-    """Whether the camera only turns in some of the views, as far as that was asked."""
+    """Whether the camera only rotates in some of the views, as far as it was tested."""
 
     def only_turns(self, keys: Collection[int]) -> bool:
-        """Return whether the camera only turns in some of the views."""
+        """Return whether the camera only rotates in some of the views."""
         some = frozenset(keys)
         if some not in self.turns:
             places = {key: view.xy for key, view in self.problem.views.items()}
@@ -158,8 +158,7 @@ class _Work:
 
 def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, Any]]:
     """Maps that grow from two keyframes, one from a given pair, each with pycolmap's own; none of a camera that only
-    turns.
-    """
+    rotates."""
     settings = work.settings
     options = mapper_options(work.camera, work.free_camera, settings)
     if settings.rough_iterations:
@@ -178,16 +177,16 @@ def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, A
 
 
 def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
-    """Return a map that was grown roughly, adjusted as a whole; as it is where too little would be left of it."""
+    """Return a roughly grown map adjusted as a whole; unchanged where too little of it would remain."""
     if not work.settings.rough_iterations:
         return found
     whole = _adjust(work, model)
-    own = without_beside(whole, work.problem)
+    own = without_context(whole, work.problem)
     return own if _enough(whole, work.settings) and len(own.T_map_cam) >= 2 else found
 
 
 def _adjust(work: _Work, model: Any) -> SparseMap:
-    """Return a map that was adjusted as a whole."""
+    """Return a map adjusted as a whole."""
     settings = work.settings
     options = mapper_options(work.camera, work.free_camera, settings)
     adjustment = pycolmap.BundleAdjustmentOptions()
@@ -196,7 +195,7 @@ def _adjust(work: _Work, model: Any) -> SparseMap:
     adjustment.print_summary = False
     solver = adjustment.ceres.solver_options
     solver.num_threads, solver.max_num_iterations = 1, settings.whole_iterations
-    solver.function_tolerance = settings.settled
+    solver.function_tolerance = settings.tolerance
     mapper = pycolmap.IncrementalMapper(work.cache)
     mapper.begin_reconstruction(model)
     change = options.ba_global_max_refinement_change
@@ -206,13 +205,13 @@ def _adjust(work: _Work, model: Any) -> SparseMap:
 
 
 def _map_of(work: _Work, model: Any) -> SparseMap:
-    """Return what pycolmap made of a problem, without keyframes that their matches contradict."""
+    """Return pycolmap's map of a problem, without keyframes that their matches contradict."""
     found = sparse_map(model, work.problem, work.camera)
     return _borne_out(found, work) if work.problem.matched else found
 
 
 def _enough(found: SparseMap, settings: MappingSettings) -> bool:
-    """Return whether a map is large enough to be believed."""
+    """Return whether a map is large enough."""
     return len(found.points) >= settings.least_points and len(found.T_map_cam) >= 2
 
 
@@ -221,17 +220,17 @@ def _largest_first(found: SparseMap) -> tuple[int, int]:
     return -len(found.T_map_cam), min(found.T_map_cam)
 
 
-def without_beside(found: SparseMap, problem: MapProblem) -> SparseMap:
-    """Return the map without the views beside."""
-    poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.beside}
-    seen = {k: view for k, view in found.seen.items() if k not in problem.beside}
+def without_context(found: SparseMap, problem: MapProblem) -> SparseMap:
+    """Return the map without the context views."""
+    poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.context}
+    seen = {k: view for k, view in found.seen.items() if k not in problem.context}
     return replace(found, T_map_cam=poses, seen=seen)
 
 
 def steady(found: SparseMap, most: float) -> bool:
-    """Return whether what keyframes see lies as deep as what the next one sees, within a factor.
+    """Return whether the depth of keyframes' points changes by less than a factor from one to the next.
 
-    A map whose scale was lost where the camera turned explains the pictures as well, but there depth jumps (decision
+    A map that lost its scale where the camera rotated explains the pictures as well, but there depth jumps (decision
     0128).
     """
     if most <= 1.0:
@@ -244,16 +243,16 @@ def steady(found: SparseMap, most: float) -> bool:
 
 
 def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
-    """Return whether two maps that fell into no pieces hold as many keyframes and explain the pictures alike.
+    """Return whether two unbroken maps hold as many keyframes and explain the pictures equally well.
 
-    Bent rooms may agree too, but where a room bends something is often left that does not fit.
+    Deformed maps may agree too, but where a map is deformed some part of it often does not fit.
     """
     largest = [(len(maps[0].T_map_cam), maps[0].error_px) for maps in grown if len(maps) == 1]
     return any(a == b and max(e, f) <= settings.same_error * min(e, f) for (a, e), (b, f) in combinations(largest, 2))
 
 
 def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
-    """Return those whose largest map has the least error among the ones that are about as large as any."""
+    """Return the maps whose largest one has the least error among those about as large as any."""
     most = max((len(maps[0].T_map_cam) for maps in grown if maps), default=0)
     large = [maps for maps in grown if maps and len(maps[0].T_map_cam) >= alike * most]
     return min(large, key=lambda maps: maps[0].error_px, default=[])
@@ -278,7 +277,7 @@ def _borne_out(found: SparseMap, work: _Work) -> SparseMap:
 
 
 def mapper_with_poses(cache: Any, T_map_cam: Mapping[int, Poses]) -> tuple[Any, Any]:
-    """Return a mapper, and its map, in which all pictures have given poses and no points are made yet."""
+    """Return a mapper, and its map, in which all pictures have given poses and there are no points yet."""
     mapper = pycolmap.IncrementalMapper(cache)
     made = pycolmap.Reconstruction()
     mapper.begin_reconstruction(made)
@@ -311,9 +310,8 @@ def adjusted(
     settings: MappingSettings,
     verified: Matches | None = None,
 ) -> SparseMap | None:
-    """A map of views whose poses are about right: its points are made anew, and all is adjusted; None where they are
-    too few. `verified` is as for `correspondences`.
-    """
+    """A map of views with approximate poses: its points are triangulated anew, and all is adjusted; None for too few of
+    them. `verified` is as for `correspondences`."""
     made = _triangulated(problem, camera, T_map_cam, settings, verified)
     if made is None:
         return None
@@ -329,7 +327,7 @@ def _triangulated(
     settings: MappingSettings,
     verified: Matches | None,
 ) -> tuple[Any, Any] | None:
-    """pycolmap's correspondences and map of views whose poses are known, with points; None when none share anything."""
+    """pycolmap's correspondences and map of views whose poses are known, with points; None without correspondences."""
     known = {key: view for key, view in problem.views.items() if key in T_map_cam}
     pairs = {pair: rows for pair, rows in problem.pairs.items() if pair[0] in known and pair[1] in known}
     cache = correspondences(replace(problem, views=known, pairs=pairs), camera, "", settings, verified)
@@ -352,7 +350,7 @@ def correspondences(
     settings: MappingSettings,
     verified: Matches | None = None,
 ) -> Any:
-    """pycolmap's correspondence graph; None when no two views have anything in common.
+    """pycolmap's correspondence graph; None when no two views match.
 
     `verified` are the rows of pairs that agree on a geometry, where that is known already.
     """
@@ -367,7 +365,7 @@ def correspondences(
 def database_of(
     problem: MapProblem, camera: Camera, free_camera: str, settings: MappingSettings, verified: Matches | None
 ) -> Any:
-    """pycolmap's database, in memory; None when no two views have anything in common. `verified` is as above."""
+    """pycolmap's database, in memory; None when no two views match. `verified` is as above."""
     database = pycolmap.Database.open(":memory:")
     lens = make_lens(camera, free_camera)
     lens.camera_id = 1
@@ -420,7 +418,7 @@ def _two_view(
 
 
 def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
-    """Return how pycolmap grows and filters a map."""
+    """Return pycolmap's options for growing and filtering a map."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.extract_colors = 1, settings.seed, False
     options.min_num_matches, options.min_model_size = settings.least_matches, 2
@@ -432,7 +430,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     options.ba_local_max_refinements = settings.part_rounds
     options.ba_global_max_num_iterations = settings.whole_iterations
     options.ba_global_max_refinements = settings.whole_rounds
-    options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.settled
+    options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.tolerance
     options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
     mapper, unit = options.mapper, pixel_unit(camera)
     mapper.num_threads, mapper.random_seed = 1, settings.seed
@@ -452,7 +450,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
 
 
 def sparse_map(made: Any, problem: MapProblem, camera: Camera) -> SparseMap:
-    """Return what pycolmap made of a problem."""
+    """Return pycolmap's map of a problem."""
     poses: dict[int, Poses] = {}
     for image_id in sorted(made.reg_image_ids()):
         poses[image_id - 1] = inverse(matrix_of(made.images[image_id].cam_from_world()))

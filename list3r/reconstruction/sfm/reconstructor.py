@@ -1,9 +1,9 @@
 """Reconstruction `sfm`: RGB video on a CPU.
 
-Corners are followed through the chunk (`tracks`), its keyframes mapped by pycolmap (`links`, `mapping`), the frames
-between them posed by the map (`fill`), and dense depth swept between the posed frames (`mvs`). The chunk's frame is the
-camera of its first posed frame, its unit such that the middle of all depths is 2; its scale is relative. With given
-poses the structure is triangulated in the source's world. Decision 0066 has the figures.
+Corners are tracked through the chunk (`tracks`), its keyframes mapped by pycolmap (`links`, `mapping`), the frames
+between them posed by the map (`frame_poses`), and dense depth swept between the posed frames (`mvs`). The chunk's frame
+is the camera of its first posed frame, its unit such that the median of all depths is 2; its scale is relative. With
+given poses the structure is triangulated in the source's world. Decision 0066 has the figures.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from list3r.reconstruction.poses import given_poses, select_keyframes
 from list3r.reconstruction.registry import ModelOptions
 from list3r.reconstruction.sfm.adjustment import agreeing_rows
 from list3r.reconstruction.sfm.colmap import pixel_unit
-from list3r.reconstruction.sfm.fill import PosedSegment, fill_segments
+from list3r.reconstruction.sfm.frame_poses import PosedSegment, pose_segments
 from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import make_finder
-from list3r.reconstruction.sfm.links import corner_problem, keyframe_problem, step_beside, with_neighbours
+from list3r.reconstruction.sfm.links import context_step, corner_problem, keyframe_problem, with_neighbours
 from list3r.reconstruction.sfm.mapping import MapProblem, Matches, SparseMap, build_maps, triangulate
 from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
@@ -62,16 +62,16 @@ class SfmReconstructor:
     camera_known: bool = True
     """Otherwise the focal length is estimated from the chunk alone."""
     detector: LearnedDetector | None = None
-    """What finds the features of keyframes that nothing can be followed between; None for SIFT."""
+    """Finds the features of keyframes that tracks do not connect; None for SIFT."""
 
     def __post_init__(self) -> None:
         if self.poses not in ("given", "estimate"):
             raise OptionError(f"poses {self.poses!r}: choose given or estimate")
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Reconstruct the largest part of a chunk that hangs together; the other frames are not posed.
+        """Reconstruct the largest connected part of a chunk; the other frames are not posed.
 
-        Raises `TrackingError` when the camera cannot be followed through any two frames, with the reason.
+        Raises `TrackingError` when the camera cannot be tracked through any two frames, with the reason.
         """
         grays = [gray_of(f) for f in frames]
         return self._finish(frames, self._segments(frames, grays, camera)[0])
@@ -83,7 +83,7 @@ class SfmReconstructor:
         around: Around | None = None,
         deep: Collection[int] | None = None,
     ) -> list[Reconstruction]:
-        """All parts of a chunk that hang together, in order of time; what lies in none is among the largest's frames.
+        """All connected parts of a chunk, in order of time; frames of none are among the largest's.
 
         With `around` some frames before and behind the chunk are mapped with it. With `deep` only the frames of these
         numbers get depth, and the others a pose. Raises `TrackingError` as above.
@@ -123,7 +123,7 @@ class SfmReconstructor:
             return [self._given(frames, tracks, problem, camera)]
         _check_motion(frames, tracks, s)
         maps = self._maps(frames, grays, tracks, problem, camera, around)
-        segments = fill_segments(maps, tracks, grays, s.fill)
+        segments = pose_segments(maps, tracks, grays, s.fill)
         if not segments:
             raise _no_map(frames, tracks)
         return segments
@@ -139,12 +139,12 @@ class SfmReconstructor:
     ) -> list[SparseMap]:
         """Maps of the keyframes, made with the help of frames around the chunk."""
         s = self.settings
-        before, behind = ((), ()) if around is None else around(step_beside(tracks, s.links), s.links.beside)
-        beside = [*before, *behind]
-        early, late = np.split(len(frames) + np.arange(len(beside)), [len(before)])
+        before, behind = ((), ()) if around is None else around(context_step(tracks, s.links), s.links.context)
+        context = [*before, *behind]
+        early, late = np.split(len(frames) + np.arange(len(context)), [len(before)])
         count = s.links.ahead_features
         few = replace(s.links.features, width=s.links.ahead_width, count=count, learned_count=count)
-        seen, colors = [*grays, *map(gray_of, beside)], [f.color for f in (*frames, *beside)]
+        seen, colors = [*grays, *map(gray_of, context)], [f.color for f in (*frames, *context)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         if not self.camera_known:
@@ -177,7 +177,7 @@ class SfmReconstructor:
         deep: Collection[int] | None = None,
         in_place: bool = False,
     ) -> Reconstruction:
-        """Dense depth, units, keyframes; `in_place` leaves frame of reference and scale as they are."""
+        """Dense depth, units, keyframes; `in_place` keeps frame of reference and scale."""
         T, posed = np.tile(np.eye(4), (len(frames), 1, 1)), np.zeros(len(frames), bool)
         for position, pose in segment.T_map_cam.items():
             T[position], posed[position] = pose, True
@@ -232,7 +232,7 @@ def _with_given_poses(found: SparseMap, poses: dict[int, Poses], tracks: CornerT
 
 
 def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSettings) -> None:
-    """Raise `TrackingError` for frames in which nothing can be followed or nothing moves."""
+    """Raise `TrackingError` for frames without trackable texture or without motion."""
     if len(frames) < 2:
         raise BaselineError(f"{_span(frames)}: depth from colour needs at least two frames from different places")
     if tracks.run.max(initial=-1) < 0:
@@ -242,11 +242,11 @@ def _check_motion(frames: Sequence[Frame], tracks: CornerTracks, settings: SfmSe
             why = f"pictures of {width}x{height} are too small; give them as they were taken"
         raise TrackingError(f"{_span(frames)}: no texture to follow; {why}")
     if np.nansum(tracks.flow) < settings.least_flow:
-        raise BaselineError(f"{_span(frames)}: the camera stands still; depth from colour needs it to move")
+        raise BaselineError(f"{_span(frames)}: the camera does not move, and depth from colour needs motion")
 
 
 def _no_map(frames: Sequence[Frame], tracks: CornerTracks) -> TrackingError:
-    """Return what is wrong with frames of which no map could be made."""
+    """Return the error for frames of which no map could be made."""
     if int(tracks.run.max()) > len(tracks.run) // 4:
         why = "the camera moves too fast to be followed; film slower, or take more frames"
         return TrackingError(f"{_span(frames)}: {why}")

@@ -1,11 +1,11 @@
-"""Follow corners through a chunk: pyramidal Lucas-Kanade from frame to frame.
+"""Track corners through a chunk: pyramidal Lucas-Kanade from frame to frame.
 
-In keyframes, and every few frames, each position is then refined against the frame where the corner was first seen, so
-that a track does not creep.
+In keyframes, and every few frames, each position is then refined against the corner's first frame, so that a track does
+not drift.
 
-Frames that saw the picture move enough become keyframes, which is where new corners are taken up. Where nearly all
-corners are lost at once the next few frames are tried (blur, a flash, a black frame); when they are lost in those too
-(a jerk) all tracks end and a new run of tracks begins. Pictures are first brought to one brightness where the camera
+Frames after enough motion become keyframes, which is where new corners are detected. Where nearly all corners are lost
+at once the next few frames are tried (blur, a flash, a black frame); when they are lost in those too (a jerk) all
+tracks end and a new run of tracks begins. Pictures are first brought to one brightness where the camera
 changed it (research/colour-video 0070).
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.features.local import shrinkage, shrunk
-from list3r.reconstruction.ranks import median, medians
+from list3r.reconstruction.order_statistics import median, medians
 from list3r.reconstruction.sfm.settings import CornerSettings
 
 Gray = NDArray[np.uint8]
@@ -32,23 +32,23 @@ class CornerTracks:
     """Observations of corners in F frames."""
 
     ids: tuple[Ints, ...]
-    """Track numbers seen in each frame, ascending. F arrays of shape (N,)."""
+    """Track numbers in each frame, ascending. F arrays of shape (N,)."""
     xy: tuple[Floats, ...]
-    """Where, px of the full picture. F arrays of shape (N, 2)."""
+    """Their pixels in the full picture. F arrays of shape (N, 2)."""
     keyframes: tuple[int, ...]
     """Positions of the keyframes, ascending."""
     run: NDArray[np.int64]
-    """Number of the run of tracks that each frame belongs to, -1 for a frame without corners. Shape (F,)."""
+    """Number of the run of tracks of each frame, -1 for a frame without corners. Shape (F,)."""
     flow: Floats
     """Median motion of the corners since the frame before, by the longer side; NaN where unknown. Shape (F,)."""
 
 
 def follow_corners(grays: Sequence[Gray], settings: CornerSettings | None = None) -> CornerTracks:
-    """Follow corners through grey pictures of one size."""
+    """Track corners through grey pictures of one size."""
     chosen = settings or CornerSettings()
     follower = _Follower(chosen, grays[0].shape)
     while (at := len(follower.ids)) < len(grays):
-        ahead = grays[at : at + 1 + chosen.look_past]
+        ahead = grays[at : at + 1 + chosen.most_lost]
         skipped = next((n for n, gray in enumerate(ahead) if follower.follow(gray)), None)
         if skipped is None:
             follower.start(grays[at])
@@ -63,8 +63,8 @@ def as_bright(
     """`old` with the brightness and contrast of `new`, as a camera changes them between two frames; `old` itself where
     they differ by less than `least` grey values.
 
-    `values` are grey values of both where they show the same, (N,) each; without, all pixels are compared by rank, as
-    of frames that follow each other. What is black or blown out in either tells nothing.
+    `values` are grey values of both at common points, (N,) each; without, all pixels are compared by rank, as of
+    frames that follow each other. Pixels that are black or saturated in either are ignored.
     """
     if values is None:
         ranks = np.linspace(0.02, 0.98, 49)
@@ -84,21 +84,21 @@ def as_bright(
         off = np.abs(gain * a + offset - b)
         kept = off <= max(2.0, 3.0 * median(off))
     was, left = median(np.abs(a - b)), median(np.abs(gain * a + offset - b))
-    if was < least or left > _UNTOLD * was:
+    if was < least or left > _MOST_UNEXPLAINED * was:
         return old
     return np.asarray(
         cv2.LUT(old, np.clip(np.rint(gain * np.arange(256.0) + offset), 0, 255).astype(np.uint8)), np.uint8
     )
 
 
-_UNTOLD = 0.5
-"""Most that brightness and contrast may leave of the difference that they are to explain."""
+_MOST_UNEXPLAINED = 0.5
+"""Most of the difference that brightness and contrast may leave unexplained."""
 _BLACK, _WHITE = 8.0, 247.0
-"""Grey values beyond which a camera tells no difference."""
+"""Grey values beyond which a camera is saturated."""
 _LEAST_USABLE = 12
-"""Fewest values that tell how brightness changed."""
+"""Fewest values that determine a change of brightness."""
 _GAINS = (0.25, 4.0)
-"""Changes of contrast that are believed."""
+"""Accepted changes of contrast."""
 
 
 def smoothed(gray: Gray) -> Gray:
@@ -107,7 +107,7 @@ def smoothed(gray: Gray) -> Gray:
 
 
 def values_at(image: Gray, xy: Floats) -> NDArray[np.float64]:
-    """Values of the pixels nearest to places (N, 2); those outside count as the rim. Shape (N,)."""
+    """Values of the pixels nearest to positions (N, 2); the border beyond the picture. Shape (N,)."""
     x, y = np.clip(np.rint(xy), 0, np.array(image.shape[::-1]) - 1).astype(int).T
     return np.asarray(image[y, x], np.float64)
 
@@ -117,19 +117,19 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 
 
 def _inside(xy: Floats, gray: Gray) -> NDArray[np.bool_]:
-    """Which places (N, 2) lie in a picture, off its border. Shape (N,)."""
+    """Which positions (N, 2) are in a picture, off its border. Shape (N,)."""
     height, width = gray.shape
     return np.asarray((xy >= 1).all(axis=1) & (xy[:, 0] < width - 2) & (xy[:, 1] < height - 2), np.bool_)
 
 
 @dataclass
 class _Alive:
-    """Corners being followed."""
+    """Corners being tracked."""
 
     ids: Ints
     xy: Floats
     origin: Ints
-    """Position of the frame where each was first seen."""
+    """Position of the first frame of each."""
     origin_xy: Floats
 
     @staticmethod
@@ -147,22 +147,22 @@ class _Follower:
     shape: tuple[int, ...]
     alive: _Alive = field(default_factory=_Alive.none)
     pictures: dict[int, Gray] = field(default_factory=dict)
-    """Pictures that corners alive were first seen in, and the last one that was followed."""
+    """First pictures of the corners alive, and the last tracked one."""
     smooth: dict[int, Gray] = field(default_factory=dict)
     """Some of them `smoothed`."""
     last: int = -1
-    """Position of the last frame that was followed."""
+    """Position of the last tracked frame."""
     ids: list[Ints] = field(default_factory=list)
     xy: list[Floats] = field(default_factory=list)
     keyframes: list[int] = field(default_factory=list)
     runs: list[int] = field(default_factory=list)
     flows: list[float] = field(default_factory=list)
     at_keyframe: _Alive = field(default_factory=_Alive.none)
-    """Corners as the last keyframe saw them."""
+    """Corners in the last keyframe."""
     next_id: int = 0
     run: int = -1
     unrefined: int = 0
-    """Frames since the last one in which places were refined."""
+    """Frames since the last one in which positions were refined."""
     _moved: float = float("nan")
     """Median motion of the corners to the last frame, by the longer side; NaN where unknown,"""
     motion: Floats = field(default_factory=lambda: np.zeros(2, np.float32))
@@ -173,7 +173,7 @@ class _Follower:
         self.longer = max(self.shape) * self.shrink
 
     def follow(self, gray: Gray) -> bool:
-        """Look for the corners in a frame; False, and nothing changed, when nearly all of them are lost."""
+        """Track the corners into a frame; False, and nothing changed, when nearly all of them are lost."""
         before, small = len(self.alive.ids), shrunk(gray, self.shrink)
         if not before:
             return False
@@ -190,7 +190,7 @@ class _Follower:
         return True
 
     def note(self, skipped: int, gray: Gray) -> None:
-        """Take down the frame in which the corners were found, and those skipped before it."""
+        """Record the frame in which the corners were found, and those skipped before it."""
         for _ in range(skipped):
             self._append(_Alive.none(), float("nan"))
         position = len(self.ids)
@@ -222,7 +222,7 @@ class _Follower:
         self.flows.append(flow)
 
     def tracks(self) -> CornerTracks:
-        """All that was followed. The last frame of each run is a keyframe."""
+        """All tracks. The last frame of each run is a keyframe."""
         run = np.array(self.runs, np.int64)
         ends = {int(np.flatnonzero(run == r)[-1]) for r in np.unique(run[run >= 0])}
         keyframes = tuple(sorted(ends | set(self.keyframes)))
@@ -255,7 +255,7 @@ class _Follower:
         return _Alive(alive.ids, place, alive.origin, alive.origin_xy).where(good & _inside(place, gray))
 
     def _refined(self, found: _Alive, gray: Gray) -> _Alive:
-        """Return the corners where they look most like where they were first seen, without those that do not."""
+        """Return the corners at the best match with their first observation, without bad matches."""
         s, xy, smooth = self.settings, found.xy.copy(), smoothed(gray)
         good, size = np.ones(len(xy), bool), (s.window_px, s.window_px)
         for origin in np.unique(found.origin).tolist():
@@ -276,7 +276,7 @@ class _Follower:
         return _Alive(found.ids, xy, found.origin, found.origin_xy).where(good & _inside(xy, gray))
 
     def _moved_enough(self, now: _Alive) -> bool:
-        """Return whether corners are so far from where the last keyframe saw them, or so few, that one is due."""
+        """Return whether the corners are so far from the last keyframe, or so few, that one is due."""
         old = self.at_keyframe
         _, here, there = np.intersect1d(now.ids, old.ids, assume_unique=True, return_indices=True)
         if len(here) < self.settings.keyframe_survival * len(old.ids):
@@ -285,7 +285,7 @@ class _Follower:
         return bool(np.median(moved) > self.settings.keyframe_flow * self.longer)
 
     def _take_up(self, gray: Gray, position: int) -> None:
-        """Make the frame a keyframe: fill up with corners where none are followed."""
+        """Make the frame a keyframe: add corners where none are tracked."""
         s, alive = self.settings, self.alive
         gap = max(3.0, s.spacing * self.longer)
         strength = cv2.cornerMinEigenVal(gray, 3, ksize=3)

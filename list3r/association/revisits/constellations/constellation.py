@@ -1,4 +1,4 @@
-"""The things of one chunk as a constellation: what each is like from any side, and where it stands with up known."""
+"""The instances of one chunk as a constellation: appearance and shape of each, and its position with up known."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ConstellationSettings:
-    """Which things of a chunk make its constellation."""
+    """Which instances of a chunk form its constellation."""
 
     most_instances: int = 60
-    """Those seen in most frames."""
+    """Most instances, those seen in most frames."""
     trim: float = 0.04
     """Share of the support points left outside at either end of each axis of a box."""
     least_points: int = 8
     """Fewer support points give no box."""
     most_size: float = 1.1
-    """Things longer than this share of the chunk's typical depth are no landmarks."""
+    """Instances longer than this share of the chunk's typical depth are no landmarks."""
     level_deg: float = 20.0
-    """A structure plane this near to level or to upright, as the cameras are held, tells which way is up."""
+    """A structure plane within this of level or of upright, as the cameras are held, determines the vertical."""
 
 
 @dataclass(frozen=True)
 class Constellation:
-    """Things of one chunk in its upright frame, N of them: z up, origin and units of the chunk."""
+    """N instances of one chunk in its upright frame: z up, origin and units of the chunk."""
 
     local_id: Ints
     """Shape (N,)."""
     feature: Array
     """Unit length. Shape (N, D)."""
     center: Array
-    """Middle of the upright box. Shape (N, 3)."""
+    """Centre of the upright box. Shape (N, 3)."""
     size: Array
     """Longer and shorter side of the footprint, and height. Shape (N, 3)."""
     color: Array
-    """Mean colour's share of red and of green, which hardly depend on brightness. Shape (N, 2)."""
+    """Share of red and of green in the mean colour, nearly independent of brightness. Shape (N, 2)."""
     R_up_chunk: Array
     """Shape (3, 3)."""
     unit: float
@@ -86,7 +86,7 @@ def make_constellation(
 
 
 def upright(nodes: Sequence[LocalNode], T_chunk_cam: Array, settings: ConstellationSettings) -> Array:
-    """Return R_up_chunk: the turn that sets a chunk upright, by how its cameras were held and by its structure planes.
+    """Return R_up_chunk: the rotation that makes a chunk upright, from its cameras' x axes and its structure planes.
 
     People hold a camera level, so its x axis is level; floors are level and walls upright.
     """

@@ -1,7 +1,7 @@
-"""Match two constellations: the similarities about the vertical that put most things on things like them.
+"""Match two constellations: the similarities about the vertical that align most instances with similar ones.
 
-With up known two matched things fix a similarity (yaw, scale, shift), so all pairs of candidate matches are tried and
-each is judged by all other candidates: the largest set of matches that agree, found without chance.
+With up known two matched instances determine a similarity (yaw, scale, shift), so all pairs of candidate matches are
+tried and each is scored by all other candidates: the largest set of matches that agree, found without sampling.
 """
 
 from __future__ import annotations
@@ -20,50 +20,50 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class MatchingSettings:
-    """How things are matched. Lengths are shares of the chunk's typical depth."""
+    """How instances are matched. Lengths are shares of the chunk's typical depth."""
 
     candidates: int = 4
-    """Most candidates of a thing, those most like it."""
+    """Most candidates of an instance, the most similar ones."""
     least_likeness: float = 0.4
-    """Least log odds that two things are one, by what they are like, for a candidate."""
+    """Least log odds of a candidate that two instances are one object, by appearance, colour and shape."""
     scale_range: float = 1.0
     """Largest log of the scale between two chunks without metric scale,"""
     metric_range: float = 0.06
     """and with it."""
     size_range: float = 0.7
-    """Largest log ratio of two things' sizes beyond that scale: each is seen in part."""
+    """Largest log ratio of two instances' sizes beyond that scale: each is seen in part."""
     least_apart: float = 0.15
-    """Two matches nearer to each other than this fix no direction."""
+    """Two matches nearer to each other than this determine no direction."""
     place: float = 0.06
-    """Deviation of a thing's middle between two chunks,"""
+    """Standard deviation of an instance's centre between two chunks,"""
     place_of_size: float = 0.22
-    """and as a share of its size: what is seen from one side has its middle nearer to that side."""
+    """and as a share of its size: the centre of a partial view is nearer to the camera."""
     hypotheses: int = 4000
     """Most pairs of matches that are tried, the likeliest ones."""
     refined: int = 24
     """Best hypotheses that are refined."""
     apart: float = 0.25
-    """Two hypotheses are one when they put the things this near,"""
+    """Two hypotheses are one when they place the instances within this"""
     apart_deg: float = 15.0
-    """turned by at most this."""
+    """and within this rotation."""
 
 
 @dataclass(frozen=True)
 class ConstellationMatch:
-    """A similarity of two upright frames and the things that agree on it."""
+    """A similarity of two upright frames and its inlier instances."""
 
     S_v_u: Sim3
     """From the upright frame of u to that of v."""
     pairs: Ints
-    """Rows of u's and of v's things. Shape (P, 2)."""
+    """Rows of u's and of v's instances. Shape (P, 2)."""
     score: float
-    """Sum of the log odds of the pairs, each less by its misfit."""
+    """Sum of the log odds of the pairs, each reduced by its misfit."""
     misfit: float
     """Root mean square distance of the pairs, in deviations."""
 
 
 def likeness(u: Constellation, v: Constellation) -> Array:
-    """Return the log odds that two things are one, by looks, colour and shape. Shape (N_u, N_v)."""
+    """Return the log odds that two instances are one object, by appearance, colour and shape. Shape (N_u, N_v)."""
     out = np.zeros((len(u.local_id), len(v.local_id)))
     if u.space == v.space and u.feature.shape[1] == v.feature.shape[1] and u.feature.shape[1]:
         cosine = u.feature @ v.feature.T
@@ -79,7 +79,7 @@ def likeness(u: Constellation, v: Constellation) -> Array:
 def match_constellations(
     u: Constellation, v: Constellation, metric: bool, settings: MatchingSettings | None = None
 ) -> list[ConstellationMatch]:
-    """Return the best hypotheses, best first, no two of them alike; none where too little is there."""
+    """Return the best distinct hypotheses, best first; none for too few candidates."""
     s = settings or MatchingSettings()
     if min(len(u.local_id), len(v.local_id)) < 3:
         return []
@@ -101,7 +101,7 @@ def match_constellations(
 
 
 def _candidates(odds: Array, s: MatchingSettings) -> Ints:
-    """Return pairs of things that may be one, in order of u. Shape (M, 2)."""
+    """Return pairs of instances that may be one object, in order of u. Shape (M, 2)."""
     kept = np.zeros(odds.shape, bool)
     for axis in (0, 1):
         rank = np.argsort(np.argsort(-odds, axis=axis, kind="stable"), axis=axis)
@@ -156,7 +156,7 @@ class _Candidates:
         return Sim3(scale, R, middle_v - scale[:, None] * np.einsum("hij,hj->hi", R, middle_u))
 
     def scores(self, S: Sim3) -> Array:
-        """Return the evidence for each similarity: no thing counts twice on either side. Shape (H,)."""
+        """Return the evidence for each similarity: no instance counts twice on either side. Shape (H,)."""
         gain = self._gain(S)
         of_u = np.maximum.reduceat(gain, self._first, axis=1).sum(axis=1)
         of_v = np.maximum.reduceat(gain[:, self._by_v], self._first_v, axis=1).sum(axis=1)
@@ -169,7 +169,7 @@ class _Candidates:
         return np.asarray(np.where(sized, self._odds * np.maximum(0.0, 1.0 - off / 2.5**2), 0.0))
 
     def refined(self, S: Sim3, metric: bool) -> ConstellationMatch | None:
-        """Return the match that a similarity grows to, None where less than three things agree."""
+        """Return the match refined from a similarity, None where less than three instances agree."""
         pairs = np.zeros(0, np.int64)
         for _ in range(4):
             gain = self._gain(Sim3(S.scale[None], S.rotation[None], S.translation[None]))[0]

@@ -1,4 +1,4 @@
-"""Bring two chunks' surfaces together from a rough similarity: floors, walls, tops, and what both saw of things."""
+"""Align two chunks' surfaces from a rough similarity: floors, walls, tables, and the shared sides of instances."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SurfaceFitSettings:
-    """How surfaces are brought together. Lengths are shares of the target's typical depth."""
+    """How surfaces are aligned. Lengths are shares of the target's typical depth."""
 
     source_points: int = 1500
     target_points: int = 6000
     neighbours: int = 12
-    """Points that give a surface its normal."""
+    """Points that determine a surface's normal."""
     reaches: tuple[float, ...] = (0.16, 0.11, 0.07, 0.05)
-    """Distances up to which surfaces are taken for one, one round after another."""
+    """Largest distance of corresponding points, by round."""
     steps: int = 4
     """Steps of each round."""
     least_cosine: float = 0.75
-    """Between the normals, whichever side they were seen from, of one surface."""
-    anchor: float = 0.08
-    """Deviation of a thing's middle, which holds what surfaces leave open."""
-    anchor_weight: float = 0.05
-    """Weight of all things against all surfaces."""
+    """Least cosine between the normals, up to sign, of corresponding points."""
+    instance_sigma: float = 0.08
+    """Standard deviation of an instance's centre, which constrains the directions that surfaces leave open."""
+    instance_weight: float = 0.05
+    """Weight of all instances against all surfaces."""
     upright: float = 0.065
-    """Weight of both chunks' estimates of up, which are sure to a degree or two,"""
+    """Weight of both chunks' estimates of up, which are accurate to a degree or two,"""
     scaled: float = 0.02
-    """and of the scale by the things: smaller copies fit surfaces too well."""
+    """and of the scale by the instances: smaller copies fit surfaces too well."""
 
 
 @dataclass(frozen=True)
 class KnownRelation:
-    """What is known of a relation besides surfaces."""
+    """Evidence for a relation other than surfaces."""
 
     middle_u: Array
-    """Middles of matched things in u. Shape (P, 3)."""
+    """Centres of matched instances in u. Shape (P, 3)."""
     middle_v: Array
     """The same in v. Shape (P, 3)."""
     up_u: Array
@@ -52,24 +52,24 @@ class KnownRelation:
     up_v: Array
     """Unit length. Shape (3,)."""
     scale: float
-    """By the things."""
+    """By the instances."""
 
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """What surfaces make of a similarity."""
+    """A similarity after the fit to surfaces."""
 
     S_v_u: Sim3
     fitting: float
-    """Share of u's points within the last reach of a surface of v of one direction."""
+    """Share of u's points within the last reach of a surface of v of the same direction."""
     residual: float
-    """Root mean square distance of those from the surface, share of v's typical depth."""
+    """Root mean square distance of these points from the surface, share of v's typical depth."""
     spread: float
-    """Least eigenvalue over largest of the directions of those surfaces: 0 where they leave a shift open."""
+    """Least eigenvalue over largest of these surfaces' directions: 0 where they leave a shift open."""
 
 
 class ChunkSurfaces:
-    """Points and normals of a chunk, looked up often."""
+    """Points and normals of a chunk, kept for repeated use."""
 
     def __init__(self, side: Side, unit: float, settings: SurfaceFitSettings) -> None:
         self.unit = unit
@@ -103,7 +103,7 @@ def fit_surfaces(
     metric: bool,
     settings: SurfaceFitSettings | None = None,
 ) -> SurfaceFit | None:
-    """Refine a similarity by distances from planes (Chen and Medioni, 1992), reweighted; None with too few points."""
+    """Refine a similarity by point-to-plane distances (Chen and Medioni, 1992), reweighted; None for too few points."""
     s = settings or SurfaceFitSettings()
     if min(len(u.points), len(v.points)) < 100:
         return None
@@ -129,10 +129,10 @@ def fit_surfaces(
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Points of u that lie near a surface of v of one direction."""
+    """Points of u near a surface of v of the same direction."""
 
     near: Array
-    """Those points, brought to v. Shape (N, 3)."""
+    """The points, moved to v. Shape (N, 3)."""
     normals: Array
     """Of v. Shape (N, 3)."""
     off: Array
@@ -141,7 +141,7 @@ class _Pairs:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Surfaces that are being brought together."""
+    """The inputs of a surface fit."""
 
     points: Array
     """Of u. Shape (N, 3)."""
@@ -153,7 +153,7 @@ class _Fit:
     settings: SurfaceFitSettings
 
     def pairs(self, S: Sim3, reach: float) -> _Pairs:
-        """Return what lies within a reach of one surface."""
+        """Return the corresponding points within a reach."""
         v = self.v
         there = S.apply(self.points)
         distance, at = v.tree.query(there, distance_upper_bound=reach * v.unit)
@@ -165,7 +165,7 @@ class _Fit:
         return _Pairs(p, n, np.einsum("ni,ni->n", q - p, n))
 
     def step(self, S: Sim3, reach: float) -> Sim3 | None:
-        """Return the similarity after one step of Gauss and Newton, about the middle of what is paired."""
+        """Return the similarity after one Gauss-Newton step, about the centre of the pairs."""
         s, v, held, found = self.settings, self.v, self.held, self.pairs(S, reach)
         p, n, r = found.near, found.normals, found.off
         if len(p) < 50:
@@ -175,11 +175,13 @@ class _Fit:
         arm = p - middle
         J = np.concatenate([n, np.cross(arm, n), np.einsum("ni,ni->n", arm, n)[:, None]], axis=1)
         A, b = (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r
-        things = S.apply(held.middle_u)
-        arm = things - middle
-        J_a = np.concatenate([np.tile(np.eye(3), (len(things), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
-        off = held.middle_v - things
-        weight_a = s.anchor_weight / (1 + (np.linalg.norm(off, axis=1) / (s.anchor * v.unit)) ** 2) / len(things)
+        centers = S.apply(held.middle_u)
+        arm = centers - middle
+        J_a = np.concatenate([np.tile(np.eye(3), (len(centers), 1, 1)), -skew(arm), arm[:, :, None]], axis=2)
+        off = held.middle_v - centers
+        weight_a = (
+            s.instance_weight / (1 + (np.linalg.norm(off, axis=1) / (s.instance_sigma * v.unit)) ** 2) / len(centers)
+        )
         A += np.einsum("p,pki,pkj->ij", weight_a, J_a, J_a)
         b += np.einsum("p,pki,pk->i", weight_a, J_a, off)
         lean = s.upright * v.unit**2

@@ -1,7 +1,7 @@
-"""Gather what surrounds a chunk: it and its neighbours in time, laid in its frame as if they were one chunk.
+"""Merge a chunk and its neighbours in time, in its frame, as if they were one chunk.
 
-A single chunk holds few things, most of them seen from one side, and in a symmetric room they fit the wrong way round
-as well. Its neighbours add things that do not fit there, and other sides of those that do (research/association 0147).
+A single chunk has few instances, most of them seen from one side, and in a symmetric room they also fit the wrong way
+round. Its neighbours add instances that do not fit there, and other sides of the rest (research/association 0147).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.cross_check import Side
-from list3r.association.revisits.cues import CueSettings, instance_set
+from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import FrameSamples, Support
 from list3r.memory.store.tables.local_instances import LocalNode
@@ -23,44 +23,44 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class SurroundingsSettings:
-    """What belongs to the surroundings of a chunk, and which things of two chunks are one."""
+class NeighbourhoodSettings:
+    """The neighbourhood of a chunk, and which instances of two chunks are one object."""
 
     chunks: int = 5
-    """Most chunks, itself among them; 1 takes it alone."""
+    """Most chunks, itself included; 1 takes it alone."""
     steps: int = 4
-    """Most edges between neighbours in time from it to another one."""
+    """Most edges between neighbours in time to another chunk."""
     near: float = 1.5
-    """Largest distance between the middles of two chunks, share of the typical depth."""
+    """Largest distance between the centres of two chunks, share of the typical depth."""
     apart: float = 0.5
-    """Largest distance between the middles of one thing in two chunks, share of its smaller diagonal."""
+    """Largest distance between the centres of one object in two chunks, share of its smaller diagonal."""
     log_size: float = 0.9
     """Largest difference of the logarithms of its diagonals."""
     trim: float = 0.06
     """Share of the support points left outside at either end of each axis of a box."""
     most_instances: int = 120
-    """Things of all chunks together, those seen in most frames."""
+    """Instances of all chunks together, those seen in most frames."""
 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """One chunk of the surroundings of another."""
+    """One chunk of the neighbourhood of another."""
 
     S_here_chunk: Sim3
-    """To the frame of the chunk in the middle."""
+    """To the frame of the central chunk."""
     nodes: Sequence[LocalNode]
     side: Side
 
 
 def gather(
-    parts: Sequence[Neighbour], space: str, settings: SurroundingsSettings | None = None
+    parts: Sequence[Neighbour], space: str, settings: NeighbourhoodSettings | None = None
 ) -> tuple[list[LocalNode], Side]:
     """Return the instances and the samples of several chunks in the frame of the first one.
 
-    Frames and local ids are numbered again; things of two chunks that stand in one place are one. `space` is the
-    embedding space of the features.
+    Frames and local ids are renumbered; instances of two chunks at one position are merged. `space` is the embedding
+    space of the features.
     """
-    s = settings or SurroundingsSettings()
+    s = settings or NeighbourhoodSettings()
     first = parts[0].side
     if len(parts) == 1:
         return list(parts[0].nodes), first
@@ -79,8 +79,8 @@ def gather(
     instance = np.where(together.instance >= 0, known[together.instance], -1).astype(np.int32)
     moving = frozenset(int(known[i + k * step_id]) for k, p in enumerate(parts) for i in p.side.moving)
     whole = replace(together, instance=instance)
-    cues = replace(CueSettings(), most_instances=s.most_instances)
-    return nodes, Side(whole, first.camera, instance_set(nodes, whole.T_chunk_cam, space, cues), moving)
+    similarity = replace(SimilaritySettings(), most_instances=s.most_instances)
+    return nodes, Side(whole, first.camera, instance_set(nodes, whole.T_chunk_cam, space, similarity), moving)
 
 
 def _moved_node(node: LocalNode, S: Sim3, frames: int, ids: int) -> LocalNode:
@@ -117,11 +117,11 @@ def _joined(parts: Sequence[FrameSamples]) -> FrameSamples:
 
 
 def _merged(
-    known: list[LocalNode], fresh: Sequence[LocalNode], one: dict[int, int], s: SurroundingsSettings
+    known: list[LocalNode], fresh: Sequence[LocalNode], one: dict[int, int], s: NeighbourhoodSettings
 ) -> list[LocalNode]:
-    """Return the known things with fresh ones, those that stand in one place as one; `one` tells their ids."""
+    """Return the known instances with the fresh ones, merged where they are one object; `one` receives their ids."""
     out = list(known)
-    at = {int(j): int(i) for i, j in _same_things(known, fresh, s)}
+    at = {int(j): int(i) for i, j in _matches(known, fresh, s)}
     for j, node in enumerate(fresh):
         if j in at:
             one[node.local_id] = out[at[j]].local_id
@@ -131,9 +131,9 @@ def _merged(
     return out
 
 
-def _same_things(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: SurroundingsSettings) -> Ints:
-    """Return rows of the two that are one thing, each at most once, nearest first. Shape (P, 2)."""
-    rows_u, rows_v = ([k for k, n in enumerate(nodes) if _stands(n)] for nodes in (known, fresh))
+def _matches(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: NeighbourhoodSettings) -> Ints:
+    """Return rows of the two that are one object, each at most once, nearest first. Shape (P, 2)."""
+    rows_u, rows_v = ([k for k, n in enumerate(nodes) if _is_static(n)] for nodes in (known, fresh))
     if not rows_u or not rows_v:
         return np.zeros((0, 2), np.int64)
     (center_u, size_u), (center_v, size_v) = (
@@ -154,20 +154,20 @@ def _same_things(known: Sequence[LocalNode], fresh: Sequence[LocalNode], s: Surr
     return np.array(out, np.int64).reshape(-1, 2)
 
 
-def _stands(node: LocalNode) -> bool:
+def _is_static(node: LocalNode) -> bool:
     points = node.support.points
     return not node.structure and not node.dynamic and len(points) > 0 and bool(np.isfinite(points).all())
 
 
 def _boxes(nodes: Sequence[LocalNode], trim: float) -> tuple[Array, Array]:
-    """Return middles (N, 3) and diagonals (N,) of boxes along the axes, without the outermost points."""
+    """Return centres (N, 3) and diagonals (N,) of axis-aligned boxes, without the outermost points."""
     low_high = np.array([np.quantile(n.support.points, [trim, 1 - trim], axis=0) for n in nodes]).reshape(-1, 2, 3)
     size = np.linalg.norm(low_high[:, 1] - low_high[:, 0], axis=1)
     return low_high.mean(axis=1), np.maximum(size, 1e-9)
 
 
 def _both(a: LocalNode, b: LocalNode) -> LocalNode:
-    """Return two sightings of one thing as one; its look is the mean over all frames."""
+    """Merge two local instances of one object; the feature is the mean over all frames."""
     feature = a.feature
     if a.feature.shape == b.feature.shape:
         mean = a.feature * len(a.frames) + b.feature * len(b.frames)

@@ -1,7 +1,7 @@
-"""One more chunk in a graph that is solved: chained, fitted, or with its neighbourhood moved; no more work than needed.
+"""Add one chunk to a solved graph: chained, fitted, or with its neighbourhood re-optimized.
 
-Everything follows from the chunks and edges as they are stored, so that a build that goes on after an interruption
-takes the same way as one that was not interrupted.
+The result depends only on the stored chunks and edges, so an interrupted build that is resumed takes the same steps as
+one that was not interrupted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, dijkstra
 
 from list3r.association.graph.edge_information import information_of
-from list3r.association.graph.loop_trust import NO_TRUST
+from list3r.association.graph.edge_trust import NO_TRUST
 from list3r.association.graph.pose_graph import (
     GraphResult,
     GraphSettings,
@@ -45,12 +45,12 @@ def extend(
     metric: bool,
     settings: GraphSettings | None = None,
 ) -> GraphResult:
-    """Place one more chunk in a graph whose other chunks lie as `placed` says (as `optimize` or `extend` put them).
+    """Place one more chunk in a graph whose other chunks are at `placed` (from `optimize` or `extend`).
 
-    A chunk with a single edge is chained: that is the optimum. One with loops that agree with the map is fitted to
-    it alone; if its edges do not fit then, the chunks on the way that the loops close and those near them move by a
-    Gauss-Newton step; if it joins components, all are solved from the beginning. Only the edges of the new chunk are
-    judged, and covariances of the others stay: `optimize` at the end of a session judges all.
+    A chunk with a single edge is chained: that is the optimum. One whose loops agree with the map is fitted to it
+    alone; if its edges then do not fit, the chunks on the closed loops and those near them move by a Gauss-Newton
+    step; if it joins components, the whole graph is solved again. Only the edges of the new chunk are judged, and
+    covariances of the others stay: `optimize` at the end of a session judges all.
     """
     chosen = settings or GraphSettings()
     mine = _accepted_of(new, edges)
@@ -96,9 +96,9 @@ def _accepted_of(chunk: int, edges: Sequence[Edge]) -> list[int]:
 def _moved(
     new: int, here: int, edges: Sequence[Edge], started: GraphResult, metric: bool, settings: GraphSettings
 ) -> tuple[dict[int, Sim3], list[Edge]]:
-    """Move the neighbourhood by a step and solve_with_trust the new chunk's loops; other edges are believed as before.
+    """Move the neighbourhood by a step and solve_with_trust the new chunk's loops; trust in other edges stays.
 
-    `started` holds the new chunk too, where its edge to `here` puts it. Returns the poses that moved, and all edges.
+    `started` includes the new chunk at the pose that its edge to `here` gives. Returns the moved poses, and all edges.
     """
     poses_of, components, mine = started.S_graph_chunk, started.components, _accepted_of(new, edges)
     known = [k for k, e in enumerate(edges) if e.accepted and e.u in poses_of and e.v in poses_of]
@@ -137,8 +137,8 @@ def _moved(
 
 
 def _near(new: int, here: int, ends: NDArray[np.int64], others: set[int], most: int) -> NDArray[np.int64]:
-    """Return ids of the chunks that move: all on the shortest ways from `here` to the other chunks that the new one is
-    tied to, and the nearest to those (by edges between) until there are `most`. `ends` (E, 2) are ids of all edges."""
+    """Return ids of the chunks that move: all on the shortest paths from `here` to the other chunks with an edge to the
+    new one, and those nearest to these paths (by number of edges) up to `most`. `ends` (E, 2) are ids of all edges."""
     ids, at = np.unique(ends, return_inverse=True)
     at = at.reshape(ends.shape)
     old = ~(ends == new).any(axis=1)
@@ -156,7 +156,7 @@ def _near(new: int, here: int, ends: NDArray[np.int64], others: set[int], most: 
 
 
 def _under(known: Mapping[int, T]) -> MutableMapping[int, T]:
-    """Return a mapping as `ChainMap` is declared to want it; it is never written to."""
+    """Return a mapping with the type that `ChainMap` declares; it is never written to."""
     return cast("MutableMapping[int, T]", known)
 
 
@@ -171,7 +171,7 @@ def _kind(edge: Edge) -> int:
 def _with(
     placed: GraphResult, new: int, S: Sim3, component: int, edges: Sequence[Edge], covariance: Array
 ) -> GraphResult:
-    """`placed` with one more chunk; what stays is not copied, so that a chunk costs the same in a long video."""
+    """`placed` with one more chunk; the rest is not copied, so that a chunk costs the same in a long video."""
     return GraphResult(
         ChainMap({new: S}, _under(placed.S_graph_chunk)),
         ChainMap({new: component}, _under(placed.components)),
@@ -182,7 +182,7 @@ def _with(
 
 
 def _hanging(of_here: Array, edge: Edge, here: int, information: Array) -> Array:
-    """Return covariance of a chunk at the other end of an edge from a chunk with covariance `of_here`. Shape (7, 7)."""
+    """Return the covariance of a chunk chained by an edge to a chunk with covariance `of_here`. Shape (7, 7)."""
     own = np.zeros((7, 7))
     own[: len(information), : len(information)] = np.linalg.inv(information)
     if here == edge.u:
@@ -193,7 +193,7 @@ def _hanging(of_here: Array, edge: Edge, here: int, information: Array) -> Array
 
 
 def _factors(edges: Sequence[Edge]) -> Array:
-    """Return the variance factors of adjacent and of loop edges that the last full solution found. Shape (2,)."""
+    """Return the variance factors of adjacent and of loop edges from the last full solution. Shape (2,)."""
     out = np.ones(2)
     for kind in range(2):
         known = (e.scores["variance_factor"] for e in edges if "variance_factor" in e.scores and _kind(e) == kind)

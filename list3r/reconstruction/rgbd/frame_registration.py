@@ -1,8 +1,8 @@
 """Register a view against surface points of a model: point-to-plane and brightness residuals together.
 
-Each model point is projected into the view; the surface point found there gives a point-to-plane residual along the
-model's normal, and the brightness found there a photometric one. Both are divided by their own robust scale, so that
-one weight balances them, and both are under a Huber kernel. Gauss-Newton on SE(3).
+Each model point is projected into the view; the surface point there gives a point-to-plane residual along the model's
+normal, and the brightness there a photometric one. Both are divided by their own robust scale, so that one weight
+balances them, and both are under a Huber kernel. Gauss-Newton on SE(3).
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ class Samples:
     """Brightness, as that of a view. Shape (N,)."""
 
     def laid_out(self) -> tuple[Floats, Floats, Floats]:
-        """Points, normals and brightness as compiled loops read them."""
+        """Points, normals and brightness in the layout of the compiled loops."""
         gray = np.zeros(len(self.points), np.float32) if self.gray is None else np.ascontiguousarray(self.gray)
         return np.ascontiguousarray(self.points), np.ascontiguousarray(self.normals), gray
 
 
 @dataclass(frozen=True)
 class KnownFeatures:
-    """Local features of the view that are known in the model: they hold what bare surfaces leave open."""
+    """Local features of the view with known model points: they constrain directions that bare surfaces leave open."""
 
     points: Floats
     """Model coordinates, metres. Shape (N, 3)."""
     rays_xy: Floats
-    """Where the view sees them, x / z and y / z. Shape (N, 2)."""
+    """Their positions in the view, x / z and y / z. Shape (N, 2)."""
 
     def normal_equations(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NormalEquations:
-        """Return those of the reprojection errors, in pixels of the view."""
+        """Return the normal equations of the reprojection errors, in pixels of the view."""
         R = T_model_cam[:3, :3]
         p = ((self.points - T_model_cam[:3, 3]) @ R).astype(np.float32)
         inverse_z = 1.0 / np.maximum(p[:, 2:], np.float32(0.05))
@@ -76,25 +76,25 @@ class KnownFeatures:
         return _normal_equations(slope, error.ravel(), scale)
 
     def information(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
-        """Return their information about the pose found. Shape (6, 6)."""
+        """Return their information on the pose found. Shape (6, 6)."""
         return self.normal_equations(T_model_cam, focal_px)[0]
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Where the view is expected, and how surely."""
+    """The expected pose of the view and its uncertainty."""
 
     T_model_cam: NDArray[np.float64]
     """Shape (4, 4)."""
     shift_m: float
-    """Deviation of the camera's place, metres."""
+    """Standard deviation of the camera's position, metres."""
     turn_rad: float
-    """Deviation of its direction."""
+    """Standard deviation of its direction."""
     pairs: float
-    """So many pairs tell as much as one."""
+    """Number of pairs that count as one."""
 
     def normal_equations(self, T_model_cam: NDArray[np.float64], focal_px: float) -> NormalEquations:
-        """Return those of the tangent from where the view is expected to where it is, weighted as so many pairs."""
+        """Return the normal equations of the tangent from the expected pose, weighted as that many pairs."""
         information = self.pairs * self.information(T_model_cam, focal_px)
         step = T_model_cam @ np.linalg.inv(self.T_model_cam)
         off = np.concatenate([step[:3, 3], cv2.Rodrigues(step[:3, :3])[0].ravel()])
@@ -110,25 +110,25 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class FrameRegistration:
-    """A view placed against a model."""
+    """A view registered to a model."""
 
     T_model_cam: NDArray[np.float64]
     """Shape (4, 4)."""
     overlap: float
     """Share of the model points that fall on known depth of the view."""
     inliers: float
-    """Share of those that agree within the last gate."""
+    """Share of them within the last gate."""
     residual: float
     """Robust standard deviation of the point-to-plane residuals, in units of the sensor's noise."""
     correlation: float
     """Correlation of model and view brightness over the inliers; NaN without texture or brightness."""
     pairs: int
     information: NDArray[np.float64]
-    """What is known of the left-hand tangent (translation, rotation) in model coordinates beyond what noise in
-    normals and gradients feigns. Shape (6, 6)."""
+    """Information on the left-hand tangent (translation, rotation) in model coordinates, without the share caused by
+    noise in normals and gradients. Shape (6, 6)."""
 
     def looseness_m(self, lever_m: float) -> float:
-        """Standard deviation of the motion that the pairs determine worst, metres at `lever_m` from the camera."""
+        """Standard deviation of the least determined motion, metres at `lever_m` from the camera."""
         T = self.T_model_cam
         shift = np.eye(6)
         shift[:3, 3:] = skew(T[:3, 3])  # rotate about the camera instead of the model's origin
@@ -249,7 +249,7 @@ class _SurfelPairs:
 
     @classmethod
     def of(cls, model: Samples, paired: Paired, scale: float) -> _SurfelPairs:
-        """Return what `pair_up` found of a model's points."""
+        """Return the result of `pair_up` for a model's points."""
         known, moved, points, normals, gray, uv, points_cam, residual, inverse_sigma = paired
         shares = known / max(1, len(model.points)), len(residual) / max(1, known)
         tone = None if model.gray is None else gray
@@ -275,7 +275,7 @@ def _solid_information(
     """Information without the share that comes from noise alone.
 
     A point-to-plane slope is A n with A = (I, [q]x). Noise of variance s in n adds s A A' on average, by which a bare
-    wall would seem to hold the camera; that much is taken off again.
+    wall would seem to constrain the camera; it is subtracted.
     """
     weight = (pairs.inverse_sigma / np.float32(pairs.scale)) ** 2
     weighted = weight[:, None] * pairs.moved
@@ -291,7 +291,7 @@ def _solid_information(
 def _photometric(
     pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], least_gradient: float = 0.0
 ) -> NormalEquations:
-    """Normal equations of the brightness residuals; a common change of exposure is taken out by their median."""
+    """Normal equations of the brightness residuals; their median removes a common change of exposure."""
     slope, error = _photometric_slope(pairs, frame, T, least_gradient)
     error = centred(error)
     return _normal_equations(slope, error, spread(error, 1.0))

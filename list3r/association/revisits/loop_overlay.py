@@ -1,4 +1,4 @@
-"""Pictures for `--debug`: what a revisit stands on, the two views side by side."""
+"""Pictures for `--debug`: the two views of a revisit, side by side, with the points that support it."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from list3r.memory.records import Edge, FrameSamples, Keyframe
 Image = NDArray[np.uint8]
 
 _NEAR_FRAMES = 10
-"""Frames round the other end whose points are brought over."""
+"""Frames around the other end whose points are shown."""
 _AGREES = 0.08
-"""Share of the depth by which a point may lie before or behind the surface of the other chunk and still agree."""
+"""Share of the depth within which a point agrees with the surface of the other chunk."""
 _KEPT, _REMOVED = (0, 230, 255), (255, 30, 30)
 
 
@@ -30,8 +30,8 @@ def write_loop(
 ) -> Path:
     """Write `out_dir`/edges/loop-U-V-FRAME-FRAME.png, the keyframe of either end; returns the file.
 
-    Cyan points lie where the other chunk, moved by the edge, has its surface; red ones contradict it. `edge.frames` are
-    those of the keyframes. Keyframes without a picture are grey.
+    Cyan points are on the surface of the other chunk, moved by the edge; red ones contradict it. `edge.frames` are
+    the frames of the keyframes. Keyframes without a picture are grey.
     """
     assert edge.frames is not None
     name = f"loop-{edge.u}-{edge.v}-{edge.frames[0]}-{edge.frames[1]}.png"
@@ -42,7 +42,7 @@ def write_loop(
 
 
 def draw_loop(edge: Edge, u: tuple[FrameSamples, Keyframe, Camera], v: tuple[FrameSamples, Keyframe, Camera]) -> Image:
-    """Return the both ends of a loop edge with the points of each that the other one sees. RGB, shape (h, w, 3)."""
+    """Return both ends of a loop edge with the points of each that the other one sees. RGB, shape (h, w, 3)."""
     halves, descriptions = [], []
     for (mine, keyframe, camera), (other, far, _), S_other_mine in (
         (u, v, edge.S_v_u),

@@ -1,9 +1,8 @@
-"""Register two chunks by their things alone, and say whether to believe it.
+"""Register two chunks by their instances alone, and decide whether to accept the relation.
 
-What things match is found by `matching`, where exactly by `surface_fit`; a relation is accepted by the evidence for it
-together: how many things agree and how well, that no other place fits nearly as well, how much of the surfaces meets
-and that neither chunk sees through what the other saw. The weights were chosen on simulated homes
-(research/association 0053).
+`matching` finds the matches, `surface_fit` the exact relation. It is accepted by all its evidence: the number of
+inlier instances and their misfit, the lead over any other position, the share of surfaces that meet, and that neither
+chunk sees through the other's surfaces. The weights were chosen on simulated homes (research/association 0053).
 """
 
 from __future__ import annotations
@@ -43,59 +42,59 @@ class RelationOdds:
 
     bias: float = -3.1
     match: float = 0.89
-    """Of the log of the matched things' log odds."""
+    """Of the log of the matched instances' log odds."""
     agreeing: float = 0.33
-    """Of each thing that agrees, up to 12."""
+    """Of each inlier instance, up to 12."""
     after: float = -2.6
-    """Of the things' root mean square misfit, in deviations."""
+    """Of the instances' root mean square misfit, in deviations."""
     agreement: float = 9.7
     """Of the log of the share of surface that is not seen through."""
     fitting: float = 1.0
     """Of the log of the share of surface that meets the other's."""
     likeness: float = 9.3
-    """Of the mean rank of likeness of whatever lands on each other, 0.5 by chance."""
+    """Of the mean similarity rank of instances that overlap, 0.5 by chance."""
 
 
 @dataclass(frozen=True)
 class ConstellationRegistrationSettings:
-    """How chunks are registered by their things."""
+    """How chunks are registered by their instances."""
 
     constellation: ConstellationSettings = field(default_factory=ConstellationSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     surfaces: SurfaceFitSettings = field(default_factory=SurfaceFitSettings)
     cross: CrossSettings = field(default_factory=CrossSettings)
     tried: int = 3
-    """Most hypotheses that surfaces judge,"""
+    """Most hypotheses tested on surfaces,"""
     least_pairs: int = 4
-    """of those with this many things,"""
+    """of those with this many instances,"""
     least_match: float = 5.0
     """whose log odds sum up to this."""
     believed_pairs: int = 4
-    """Things that must still agree once surfaces were brought together, for a relation to be believed."""
+    """Instances that must still agree after the surface fit for a relation to be accepted."""
     least_belief: float = 3.1
-    """Least log odds that a relation is right (`RelationOdds`) for it to be believed."""
+    """Least log odds that an accepted relation is right (`RelationOdds`)."""
     least_fitting: float = 0.1
     """Share of a chunk's surface that must meet the other's: with less a relation is loose."""
     most_rival: float = 0.9
-    """Another relation of the same chunks must have less of the believed one's support than this."""
+    """Largest support of another relation of the same chunks, as a share of the accepted one's."""
     belief: RelationOdds = field(default_factory=RelationOdds)
     place: float = 0.04
-    """Deviation of a thing's middle once surfaces were brought together, share of the typical depth,"""
+    """Standard deviation of an instance's centre after the surface fit, share of the typical depth,"""
     most_off: float = 2.0
-    """and the deviations within which a thing agrees."""
+    """and the deviations within which an instance agrees."""
     enough_fitting: float = 0.3
-    """Share of a chunk's surface that meets the other's, from which on more says nothing."""
+    """Share of a chunk's surface that meets the other's above which more adds no evidence."""
     shift: float = 0.03
-    """Deviation of a believed relation, share of the chunk's typical depth,"""
+    """Standard deviation of an accepted relation, share of the chunk's typical depth,"""
     turn_deg: float = 1.5
-    """of its turn,"""
+    """of its rotation,"""
     log_scale: float = 0.03
     """and of the logarithm of its scale."""
 
 
 @dataclass(frozen=True)
 class RegisteredChunk:
-    """One chunk as registration looks at it."""
+    """Inputs of the registration for one chunk."""
 
     constellation: Constellation
     surfaces: ChunkSurfaces
@@ -104,7 +103,7 @@ class RegisteredChunk:
 
 @dataclass(frozen=True)
 class Registration:
-    """A supposed relation of two chunks, and all that is known of it."""
+    """A candidate relation of two chunks and its evidence."""
 
     S_v_u: Sim3
     match: ConstellationMatch
@@ -115,7 +114,7 @@ class Registration:
 def register(
     u: RegisteredChunk, v: RegisteredChunk, metric: bool, settings: ConstellationRegistrationSettings
 ) -> Registration | None:
-    """Return the likeliest relation of two chunks, None where no three things agree anywhere."""
+    """Return the likeliest relation of two chunks, None where no three instances agree."""
     cu, cv = u.constellation, v.constellation
     matches = match_constellations(cu, cv, metric, settings.matching)
     found: list[Registration] = []
@@ -156,9 +155,9 @@ def log_odds(scores: Mapping[str, float], weights: RelationOdds) -> float:
 
 
 def refusal(scores: Mapping[str, float], settings: ConstellationRegistrationSettings) -> str | None:
-    """Return why a relation of these scores is not believed, or None."""
+    """Return why a relation of these scores is rejected, or None."""
     if scores["agreeing"] < settings.believed_pairs:
-        return f"with surfaces brought together only {scores['agreeing']:.0f} of them do"
+        return f"after the surface fit only {scores['agreeing']:.0f} of them do"
     if (odds := log_odds(scores, settings.belief)) < settings.least_belief:
         return f"too little evidence for it (log odds {odds:.1f}, wanted {settings.least_belief:.1f})"
     if scores["fitting"] < settings.least_fitting:
@@ -169,7 +168,7 @@ def refusal(scores: Mapping[str, float], settings: ConstellationRegistrationSett
 
 
 def _near(a: Sim3, b: Sim3, u: Constellation, v: Constellation) -> bool:
-    """Tell whether two relations put the things of u at about the same place of v."""
+    """Return whether two relations place the instances of u at about the same position in v."""
     centers = u.center @ u.R_up_chunk
     return bool(np.linalg.norm(a.apply(centers) - b.apply(centers), axis=1).mean() < 0.15 * v.unit)
 
@@ -217,7 +216,7 @@ def _described(
 
 
 def covariance(u: RegisteredChunk, metric: bool, settings: ConstellationRegistrationSettings) -> Array:
-    """Return the covariance of a believed relation, whose errors are about the middle of u's things.
+    """Return the covariance of an accepted relation, whose errors are about the centre of u's instances.
 
     Of x in S_true = S_v_u exp(x), u's units. Shape (7, 7).
     """

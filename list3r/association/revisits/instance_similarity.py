@@ -1,10 +1,10 @@
-"""What the instances of two chunks say of whether both saw one place (paper 3.2: s_sem, s_rel, s_loop).
+"""Compare the instances of two chunks as evidence for a revisit (paper 3.2: s_sem, s_rel, s_loop).
 
 Pairs P_uv are mutual nearest neighbours in the feature space, and s_sem is their mean cosine. The layout score s_rel
 does not depend on the unknown scale and rotation between the chunks: distances between matched instances are compared
-by their ratio, and triples of instances by the side from which they run clockwise, seen from above. Look-alikes make
-nearest neighbours wrong, so the layout is scored on the largest consistent set of pairs among several candidates for
-each instance; a place that only holds the same kinds of things has no such set, and s_rel vetoes it.
+by their ratio, and triples of instances by their orientation, seen from above. Repeated objects make nearest neighbours
+wrong, so the layout is scored on the largest consistent set of pairs among several candidates for each instance; a
+place with merely the same kinds of objects has no such set, and s_rel vetoes it.
 """
 
 from __future__ import annotations
@@ -23,36 +23,35 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class CueSettings:
+class SimilaritySettings:
     """How instances of two chunks are compared."""
 
     least_cosine: float = 0.5
-    """Least cosine of two features for their instances to be candidates for one thing."""
+    """Least cosine of two features for their instances to be candidates for one object."""
     candidates: int = 3
     """Most candidates for an instance."""
-    look_alike: float = 0.08
-    """Candidates whose cosine is this much below the best are look-alikes as well."""
+    cosine_margin: float = 0.08
+    """Candidates within this of the best cosine are kept as well."""
     most_instances: int = 40
     """Instances compared of a chunk, those seen in most frames first."""
     sigma: float = 0.15
     """Difference of two log distances at which a pair of pairs counts 1/e."""
     least_lean: float = 0.25
-    """Least height of a triple's normal over its area, in [0, 1], from which its turning direction seen from above
-    counts."""
+    """Least height of a triple's normal over its area, in [0, 1], from which its orientation seen from above counts."""
     consistent: float = 0.37
     """Least score of a pair of pairs for both to belong to one layout (1/e: one sigma)."""
 
 
 @dataclass(frozen=True)
 class InstanceSet:
-    """The instances of one chunk that can be recognised: what stands still and is no structure, N of them."""
+    """The instances of one chunk that can be recognised: static and no structure, N of them."""
 
     local_id: Ints
     """Shape (N,)."""
     feature: Array
     """Unit length. Shape (N, D)."""
     center: Array
-    """Middle of the support, chunk units. Shape (N, 3)."""
+    """Centre of the support, chunk units. Shape (N, 3)."""
     size: Array
     """Diagonal of the support's box without its outermost tenths, chunk units. Shape (N,)."""
     up: Array
@@ -62,8 +61,8 @@ class InstanceSet:
 
 
 @dataclass(frozen=True)
-class InstanceCues:
-    """How the instances of two chunks agree."""
+class InstanceSimilarity:
+    """Agreement of the instances of two chunks."""
 
     s_sem: float
     """Mean cosine of the mutual nearest neighbours, in [0, 1]; 0 without any."""
@@ -75,15 +74,15 @@ class InstanceCues:
     """Log of v's units over u's by the layout, NaN where there is none."""
 
 
-NO_CUES = InstanceCues(0.0, 0.0, (), float("nan"))
+NO_SIMILARITY = InstanceSimilarity(0.0, 0.0, (), float("nan"))
 
 
 def instance_set(
-    nodes: Sequence[LocalNode], T_chunk_cam: NDArray[np.float64], space: str, settings: CueSettings
+    nodes: Sequence[LocalNode], T_chunk_cam: NDArray[np.float64], space: str, settings: SimilaritySettings
 ) -> InstanceSet:
     """Return the instances of a chunk from its local nodes and the poses (G, 4, 4) of its cameras.
 
-    Structure, what moves, and what has no finite feature or no support is left out.
+    Structure, movers, and instances without a finite feature or support are left out.
     """
     usable = [n for n in nodes if not n.structure and not n.dynamic and _sound(n)]
     usable = sorted(usable, key=lambda n: (-len(n.frames), n.local_id))[: settings.most_instances]
@@ -107,43 +106,43 @@ def _sound(node: LocalNode) -> bool:
     return len(points) > 0 and bool(np.isfinite(feature).all() and np.isfinite(points).all() and feature.any())
 
 
-def compare_instances(u: InstanceSet, v: InstanceSet, settings: CueSettings | None = None) -> InstanceCues:
-    """Tell how the instances of two chunks agree. Features of two spaces cannot be compared and give no cues."""
-    chosen = settings or CueSettings()
+def compare_instances(u: InstanceSet, v: InstanceSet, settings: SimilaritySettings | None = None) -> InstanceSimilarity:
+    """Compare the instances of two chunks. Features of two spaces cannot be compared and give no similarity."""
+    chosen = settings or SimilaritySettings()
     if u.space != v.space or not len(u.local_id) or not len(v.local_id) or u.feature.shape[1] != v.feature.shape[1]:
-        return NO_CUES
+        return NO_SIMILARITY
     cosine = u.feature @ v.feature.T
     mutual = _mutual(cosine, chosen)
     s_sem = float(np.clip(cosine[mutual[:, 0], mutual[:, 1]].mean(), 0.0, 1.0)) if len(mutual) else 0.0
     layout, s_rel, log_scale = _layout(u, v, cosine, chosen)
     kept = layout if len(layout) else mutual
     pairs = tuple((int(u.local_id[i]), int(v.local_id[j])) for i, j in kept)
-    return InstanceCues(s_sem, s_rel, pairs, log_scale)
+    return InstanceSimilarity(s_sem, s_rel, pairs, log_scale)
 
 
-def loop_score(s_det: float, cues: InstanceCues, weight: float) -> float:
+def loop_score(s_det: float, similarity: InstanceSimilarity, weight: float) -> float:
     """Return s_loop of the paper, (0 to 2): weight * s_det + (1 - weight) * (s_sem + s_rel)."""
-    return weight * s_det + (1.0 - weight) * (cues.s_sem + cues.s_rel)
+    return weight * s_det + (1.0 - weight) * (similarity.s_sem + similarity.s_rel)
 
 
-def _mutual(cosine: Array, settings: CueSettings) -> Ints:
+def _mutual(cosine: Array, settings: SimilaritySettings) -> Ints:
     """Return the mutual nearest neighbours. Shape (P, 2)."""
     forth, back = cosine.argmax(axis=1), cosine.argmax(axis=0)
     rows = np.flatnonzero((back[forth] == np.arange(len(cosine))) & (cosine.max(axis=1) >= settings.least_cosine))
     return np.stack([rows, forth[rows]], axis=1)
 
 
-def _candidates(cosine: Array, settings: CueSettings) -> Ints:
-    """Return pairs of instances that may be one thing: near the best of either side. Shape (M, 2)."""
+def _candidates(cosine: Array, settings: SimilaritySettings) -> Ints:
+    """Return pairs of instances that may be one object: near the best of either side. Shape (M, 2)."""
     out = np.zeros(cosine.shape, bool)
     for axis in (0, 1):
         best = cosine.max(axis=axis, keepdims=True)
         rank = np.argsort(np.argsort(-cosine, axis=axis, kind="stable"), axis=axis)
-        out |= (rank < settings.candidates) & (cosine >= best - settings.look_alike)
+        out |= (rank < settings.candidates) & (cosine >= best - settings.cosine_margin)
     return np.argwhere(out & (cosine >= settings.least_cosine))
 
 
-def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings) -> tuple[Ints, float, float]:
+def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: SimilaritySettings) -> tuple[Ints, float, float]:
     """Return largest set of candidate pairs (P, 2) whose distances agree up to one scale, its score and log scale."""
     pairs = _candidates(cosine, settings)
     none = np.zeros((0, 2), np.int64), 0.0, float("nan")
@@ -171,7 +170,7 @@ def _layout(u: InstanceSet, v: InstanceSet, cosine: Array, settings: CueSettings
     return pairs[chosen], likeness * turned * number, median
 
 
-def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> tuple[Array, Array]:
+def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: SimilaritySettings) -> tuple[Array, Array]:
     """Return the log ratios of distances for each pair of pairs, NaN where they share an instance, and their scatter.
     (M, M)."""
     i, j = pairs.T
@@ -180,7 +179,7 @@ def _log_ratios(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettin
     apart = (i[:, None] != i[None]) & (j[:, None] != j[None])
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(apart & (d_u > 1e-12) & (d_v > 1e-12), np.log(d_v / d_u), np.nan)
-        # A thing seen from one side only has its middle off by a part of its size.
+        # The centre of an instance seen from one side only is off by a part of its size.
         loose = [np.hypot(s[:, None], s[None]) / np.maximum(d, 1e-12) for s, d in ((u.size[i], d_u), (v.size[j], d_v))]
     return ratio, settings.sigma * np.clip(np.maximum(loose[0], loose[1]), 0.5, 2.0)
 
@@ -200,7 +199,7 @@ def _scales(ratio: Array, sigma: Array, most: int = 4) -> list[float]:
     return [float(grid[p]) for p in sorted(peaks, key=lambda p: (-votes[p], p))[:most]]
 
 
-def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]:
+def _consistent(agree: Array, cosine: Array, settings: SimilaritySettings) -> list[int]:
     """Return a large set of pairs each of which agrees with every other, grown from best connected pairs of pairs."""
     linked = np.where(agree >= settings.consistent, agree, 0.0)
     strength = (linked @ linked) * (linked > 0) * (cosine[:, None] + cosine[None])
@@ -222,8 +221,8 @@ def _consistent(agree: Array, cosine: Array, settings: CueSettings) -> list[int]
     return best[1]
 
 
-def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: CueSettings) -> float:
-    """2 f - 1, at least 0; f: share of triples that run the same way round seen from above. 1 where none tells."""
+def _orientation(u: InstanceSet, v: InstanceSet, pairs: Ints, settings: SimilaritySettings) -> float:
+    """2 f - 1, at least 0; f: share of triples of equal orientation seen from above. 1 without a triple that counts."""
     if not u.up.any() or not v.up.any():
         return 1.0
     triples = np.array(list(itertools.combinations(range(len(pairs)), 3))[:2000])

@@ -1,7 +1,7 @@
-"""Which further keyframes of two chunks are worth a comparison, where a single relation ties a session to another.
+"""Which further pairs of keyframes of two chunks are compared, where a single relation joins two sessions.
 
 A short session has few chunks, and frames of a changed room in another light propose few pairs. One relation alone does
-not place a session; but it says which other keyframes should see the same (research/sessions 0056).
+not place a session; but it predicts which other keyframes overlap (research/sessions 0056).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from list3r.memory.world.session_ties import keyframes_of
 
 @dataclass(frozen=True)
 class FramesApart:
-    """When two pairs of frames are two views rather than one."""
+    """When two pairs of frames are independent."""
 
     each: int = 4
     """Least frames between them on either side, and"""
@@ -27,16 +27,16 @@ class FramesApart:
     """on both sides together."""
 
     def of(self, one: tuple[int, int], other: tuple[int, int]) -> bool:
-        """Tell whether two pairs of Frame.index are two."""
+        """Return whether two pairs of Frame.index are independent."""
         gaps = [abs(a - b) for a, b in zip(one, other, strict=True)]
         return min(gaps) >= self.each and sum(gaps) >= self.both
 
 
-def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
-    """Tell whether two relations of two sessions support each other.
+def are_independent(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart) -> bool:
+    """Return whether two relations of two sessions support each other.
 
-    Those of one pair of chunks do where their frames lie apart, or where one is by frames and the other by things.
-    Those of two pairs do not where they share a keyframe: what misled one misleads the other (research/sessions 0058).
+    Two of one pair of chunks do where their frames are apart, or where one is by frames and the other by instances.
+    Two of different pairs do unless they share a keyframe, and so its error (research/sessions 0058).
     `session_of` gives the session of every chunk.
     """
     one_pair = (e.u, e.v) == (f.u, f.v)
@@ -48,26 +48,26 @@ def are_two(e: Edge, f: Edge, session_of: Mapping[int, int], apart: FramesApart)
 
 
 @dataclass(frozen=True)
-class SecondLookSettings:
-    """Which keyframes are compared once more."""
+class FurtherPairSettings:
+    """Which further pairs of keyframes are compared."""
 
     most: int = 64
     """Pairs of keyframes."""
     apart: FramesApart = field(default_factory=FramesApart)
-    """Their frames lie apart from those of the relation,"""
+    """Their frames are apart from those of the relation,"""
     turn_deg: float = 50.0
-    """their axes enclose at most this,"""
+    """their optical axes enclose at most this,"""
     depths: float = 1.0
-    """and a way between them of one median depth of the chunk counts as much as all of that turn."""
+    """and a distance of one median depth of the chunk counts as much as this whole angle."""
 
 
-def seeing_the_same(
+def similar_views(
     edge: Edge,
     samples: tuple[FrameSamples, FrameSamples],
     keyframes: tuple[Sequence[int], Sequence[int]],
-    settings: SecondLookSettings,
+    settings: FurtherPairSettings,
 ) -> list[tuple[int, int]]:
-    """Return pairs of keyframes (Frame.index) that an edge puts beside each other, the nearest ones first.
+    """Return pairs of keyframes (Frame.index) with similar views under an edge, the most similar first.
 
     `samples` and `keyframes` are those of chunks u and v.
     """
@@ -86,13 +86,13 @@ def seeing_the_same(
 def _views(
     samples: FrameSamples, keyframes: Sequence[int], S: Sim3
 ) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return where the keyframes of a chunk stand and look, moved by a similarity."""
+    """Return positions and optical axes of the keyframes of a chunk, moved by a similarity."""
     poses = dict(zip(samples.camera_frames.tolist(), samples.T_chunk_cam, strict=True))
     return {k: (S.apply(poses[k][:3, 3]), S.rotation @ poses[k][:3, 2]) for k in keyframes if k in poses}
 
 
 def _reach(samples: FrameSamples) -> float:
-    """Return the median distance of a chunk's points from its cameras' middle, chunk units."""
+    """Return the median distance of a chunk's points from its cameras' centre, chunk units."""
     if not len(samples.points) or not len(samples.T_chunk_cam):
         return 1.0
     middle = samples.T_chunk_cam[:, :3, 3].mean(axis=0)

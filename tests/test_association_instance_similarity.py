@@ -10,7 +10,13 @@ import pytest
 
 from list3r.association.revisits.chain import ChainSettings, EdgeChains
 from list3r.association.revisits.cross_check import Side, cross_check, shared_view
-from list3r.association.revisits.cues import CueSettings, InstanceSet, compare_instances, instance_set, loop_score
+from list3r.association.revisits.instance_similarity import (
+    InstanceSet,
+    SimilaritySettings,
+    compare_instances,
+    instance_set,
+    loop_score,
+)
 from list3r.association.revisits.joint_window import Place, composed_covariance, joint_edge
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, FrameSamples, JointWindow
@@ -82,7 +88,7 @@ def test_few_or_strange_instances_give_no_layout() -> None:
         assert compare_instances(u, few).s_rel == 0.0
     assert compare_instances(u, NOWHERE).s_sem == 0.0
     assert compare_instances(u, replace(u, space="other@1/8")).s_sem == 0.0
-    assert instance_set([], np.zeros((0, 4, 4)), "test@1/8", CueSettings()).local_id.shape == (0,)
+    assert instance_set([], np.zeros((0, 4, 4)), "test@1/8", SimilaritySettings()).local_id.shape == (0,)
     heaped = replace(u, center=np.zeros_like(u.center))
     assert compare_instances(heaped, u).s_rel == 0.0
 

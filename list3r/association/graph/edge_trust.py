@@ -1,10 +1,10 @@
-"""Decide which edges the graph believes: false loops are switched off instead of bending the map.
+"""Decide which edges of the graph are inliers: false loops are switched off instead of deforming the map.
 
 A Geman-McClure kernel tightened from convex (graduated non-convexity: Yang et al., "Graduated non-convexity for robust
-spatial perception", 2020), on Mahalanobis distances. False loops that agree with each other, as those between twin
-rooms do, can win against a chain that has to bend for them; so there is a second start from the loops that lie within
-what the chain of adjacent edges can have drifted, and the explanation of least cost is taken. How far the chain can
-have drifted is measured on the loops themselves, by the median.
+spatial perception", 2020), on Mahalanobis distances. False loops that agree with each other, as between twin rooms, can
+win against a chain that must deform for them; so there is a second start from the loops within the possible drift of
+the chain of adjacent edges, and the solution of least cost is taken. The chain's drift is measured on the loops
+themselves, by the median.
 """
 
 from __future__ import annotations
@@ -23,64 +23,64 @@ Array = NDArray[np.float64]
 
 
 NO_TRUST = 1e-9
-"""What edges that are not believed weigh, so that what they alone join stays where it is."""
+"""Weight of rejected edges, so that components that only they join stay in place."""
 
 
-_SETTLED = 0.05
-"""Change of the logarithm of a variance factor that no longer matters."""
+_FACTORS_CONVERGED = 0.05
+"""Change of the log of a variance factor below which the factors have converged."""
 
 _ROUGHLY, _CLOSELY = 1e-3, 1e-9
-"""Relative gain of a step at which a stage of the annealing, and at which the solution, has settled."""
+"""Relative gain of a step at which a stage of the annealing, and at which the solution, has converged."""
 
 
 @dataclass(frozen=True)
 class TrustSettings:
-    """When an edge is believed."""
+    """When an edge is an inlier."""
 
     loop_quantile: float = 0.999
-    """Share of true loops whose error lies inside the limit, were all errors as stated."""
+    """Share of true loops whose error is inside the limit if all errors are as stated."""
     adjacent_limit: float = 4.0
     """The limit of adjacent edges, in limits of loops: this many agreeing loops outvote one."""
     least_loops: float = 0.5
-    """Least share of loops and"""
+    """Least share of inliers among loops and"""
     least_adjacent: float = 0.9
-    """of adjacent edges that must be believed before errors are taken to be as stated."""
+    """among adjacent edges for errors to be taken as stated."""
     prior_loops: int = 4
-    """Loops that support the stated drift of the chain when its true drift is measured."""
+    """Pseudo-count of loops at the stated drift when the chain's true drift is measured."""
     most_drift: float = 30.0
     """Largest factor by which the chain may have drifted more than stated (deviations, not squares)."""
     prior_freedom: float = 10.0
-    """Degrees of freedom that support the stated errors of edges."""
+    """Degrees of freedom of the prior at the stated errors of edges."""
     anneal_step: float = 1.6
     """Factor by which the kernel tightens from stage to stage of the annealing; larger ones lose true edges, see
     research/association 0042."""
     rounds: int = 8
-    """Most times that errors are scaled and edges judged again."""
+    """Most times that errors are rescaled and edges judged again."""
     iterations: int = 20
     """Most steps of a solution; each stage of the annealing takes a quarter."""
 
 
 @dataclass(frozen=True)
 class TrustedGraph:
-    """A graph with its edges judged."""
+    """A solved graph with judged edges."""
 
     poses: Sim3
     trust: Array
-    """1 for edges that count, 0 for those that do not. Shape (E,)."""
+    """1 for inlier edges, 0 for outliers. Shape (E,)."""
     squares: Array
     """Squared Mahalanobis distances of the edges, errors scaled. Shape (E,)."""
     limit: Array
-    """Largest of those that is believed. Shape (E,)."""
+    """Largest squared distance of an inlier. Shape (E,)."""
     factors: Array
     """Variance factors of adjacent and of loop edges. Shape (2,)."""
     freedom: Array
-    """Degrees of freedom behind the factors. Shape (2,)."""
+    """Degrees of freedom of the factors. Shape (2,)."""
     marginals: Marginals
 
 
 @dataclass(frozen=True)
 class Tree:
-    """The spanning tree that the start was chained along."""
+    """The spanning tree along which the start was chained."""
 
     parent: NDArray[np.int64]
     """Row of each chunk's parent, its own row for roots. Shape (K,)."""
@@ -93,7 +93,7 @@ class Tree:
 def solve_with_trust(
     problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], robust: bool, settings: TrustSettings
 ) -> TrustedGraph:
-    """Solve the graph and find which edges to believe. `loop` (E,) marks those that may be false."""
+    """Solve the graph and find the inlier edges. `loop` (E,) marks those that may be false."""
     kinds = loop.astype(np.int64)
     limit = _limits(problem, loop, settings)
     poses, trust, factors = _as_stated_or_drifted(problem, start, tree, loop, robust, settings)
@@ -105,7 +105,7 @@ def solve_with_trust(
         known, squares = marginals(scaled, poses, np.maximum(trust, NO_TRUST)), scaled.squares(poses)
         before = factors
         factors, freedom = variance_factors(squares, known.redundancy, trust, kinds, before, settings.prior_freedom)
-        if np.abs(np.log(factors / before)).max() < _SETTLED:
+        if np.abs(np.log(factors / before)).max() < _FACTORS_CONVERGED:
             break
     scaled = problem.scaled(factors[kinds])
     known = marginals(scaled, poses, np.maximum(trust, NO_TRUST))
@@ -113,7 +113,7 @@ def solve_with_trust(
 
 
 def _limits(problem: GraphProblem, loop: NDArray[np.bool_], settings: TrustSettings) -> Array:
-    """Return the largest squared Mahalanobis distance at which each edge is believed. Shape (E,)."""
+    """Return the largest squared Mahalanobis distance of an inlier, by edge. Shape (E,)."""
     limit = chi2_quantile(settings.loop_quantile, problem.size) * np.where(loop, 1.0, settings.adjacent_limit)
     return np.asarray(limit)
 
@@ -121,8 +121,8 @@ def _limits(problem: GraphProblem, loop: NDArray[np.bool_], settings: TrustSetti
 def _as_stated_or_drifted(
     problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], robust: bool, settings: TrustSettings
 ) -> tuple[Sim3, Array, Array]:
-    """Return poses, trust and variance factors with errors as stated; where too few edges are believed so, with the
-    chain's drift as large as the loops say it is."""
+    """Return poses, trust and variance factors with errors as stated; where too few edges are inliers that way, with
+    the chain's drift as measured on the loops."""
     ones, limit = np.ones(len(loop)), _limits(problem, loop, settings)
     if not loop.any() or not robust:
         return problem.solve(start, ones, settings.iterations), ones, np.ones(2)
@@ -143,14 +143,14 @@ def _first(
     limit: Array,
     settings: TrustSettings,
 ) -> tuple[Sim3, Array]:
-    """Anneal from all edges, from all with adjacent ones held, and from the loops within what the chain can have
-    drifted; the explanation of least cost."""
+    """Anneal from all edges, from all with adjacent ones kept, and from the loops within the chain's possible drift;
+    return the solution of least cost."""
     ones = np.ones(len(loop))
     within = ~loop
     within[loop] = chain_squares(problem, start, tree, loop) <= limit[loop]
     found = []
-    held = np.where(loop, limit, np.inf)
-    for first, kernel in ((ones, limit), (ones, held), (within.astype(np.float64), limit)):
+    kept = np.where(loop, limit, np.inf)
+    for first, kernel in ((ones, limit), (ones, kept), (within.astype(np.float64), limit)):
         poses = start if first.all() else problem.solve(start, np.maximum(first, NO_TRUST), settings.iterations)
         poses, _ = _anneal(problem, poses, kernel, settings, gated=not first.all())
         poses, trust = _harden(problem, poses, limit, True, settings)
@@ -164,7 +164,7 @@ def _first(
 def _anneal(
     problem: GraphProblem, poses: Sim3, limit: Array, settings: TrustSettings, gated: bool
 ) -> tuple[Sim3, Array]:
-    """Tighten the kernel step by step; from a gated start only the last stages."""
+    """Tighten the kernel in stages; from a gated start only the last stages."""
     worst = float((problem.squares(poses) / limit).max())
     mu = 2.0 if gated else max(2.0 * worst, 1.0)
     steps = settings.iterations // 4
@@ -181,7 +181,7 @@ def _anneal(
 def _harden(
     problem: GraphProblem, poses: Sim3, limit: Array, robust: bool, settings: TrustSettings
 ) -> tuple[Sim3, Array]:
-    """Solve by the edges inside their limits alone, until that set stays."""
+    """Solve with the edges inside their limits alone, until that set no longer changes."""
     inside = problem.squares(poses) <= limit if robust else np.ones(len(limit), bool)
     seen: set[bytes] = set()
     while True:
@@ -199,7 +199,7 @@ def _harden(
 def drift_factor(
     problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[np.bool_], settings: TrustSettings
 ) -> float:
-    """Estimate how many times larger (squared, at least 1) chain's drift is than its edges say: the median over loops.
+    """Estimate the chain's drift over its stated one (squared, at least 1): the median over loops.
 
     Up to half of the loops may be false.
     """
@@ -212,7 +212,7 @@ def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[
     """Return squared Mahalanobis distances of loops from the chain, by its uncertainty and their own. Shape (L,)."""
     d = problem.size
     world = adjoint(start)[:, :d, :d]
-    # Covariances of edges in the frame of the world, summed from the root.
+    # Covariances of edges in the world frame, summed from the root.
     own = np.linalg.inv(problem.information)
     total = np.zeros((len(tree.parent), d, d))
     for row in tree.order:
@@ -229,7 +229,7 @@ def chain_squares(problem: GraphProblem, start: Sim3, tree: Tree, loop: NDArray[
 
 
 def _common_ancestor(tree: Tree, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return row of the last common ancestor of pairs (binary lifting); a root where they lie in different trees."""
+    """Return row of the last common ancestor of pairs (binary lifting); a root where they are in different trees."""
     depth = np.zeros(len(tree.parent), np.int64)
     for row in tree.order:
         if tree.edge[row] >= 0:

@@ -1,4 +1,4 @@
-"""Poses of the frames between the keyframes, from the points of the map that their corners belong to."""
+"""Poses of the frames between the keyframes, from the map's points of their corners."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ class PosedSegment:
     T_map_cam: dict[int, Poses]
     """By position in the chunk."""
     seen: dict[int, tuple[Floats, NDArray[np.float64]]]
-    """Where points of the map are seen in each frame, (N, 2) px, and the points, (N, 3) map coordinates."""
+    """Pixels of the map's points in each frame, (N, 2), and the points, (N, 3) map coordinates."""
 
     def depths(self, position: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Places (N, 2), px, and depths (N,), map units, of the points seen in a frame."""
+        """Pixels (N, 2) and depths (N,), map units, of the points seen in a frame."""
         xy, points = self.seen[position]
         T_cam_map = np.linalg.inv(self.T_map_cam[position])
         z = points @ T_cam_map[2, :3] + T_cam_map[2, 3]
         return xy[z > 0].astype(np.float64), z[z > 0]
 
 
-def fill_segments(
+def pose_segments(
     maps: Sequence[SparseMap],
     tracks: CornerTracks,
     grays: Sequence[Gray],
@@ -95,7 +95,7 @@ def _fill(
 def _with_features(
     found: SparseMap, position: int, tracks: CornerTracks, xy: Floats, points: NDArray[np.float64]
 ) -> tuple[Floats, NDArray[np.float64]]:
-    """Return what a keyframe sees of the map by its corners, and what it sees by other features."""
+    """Return the map's points that a keyframe sees by its corners, and those by other features."""
     seen = found.seen[position]
     rows = np.flatnonzero(~np.isin(seen.ids, tracks.ids[position])).tolist()
     if not rows:
@@ -108,7 +108,7 @@ def _with_features(
 def pose_of(
     xy: Floats, points: NDArray[np.float64], camera: Camera, start: Poses | None, settings: FramePoseSettings
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
-    """T_map_cam from points (N, 3) and where they are seen (N, 2), and which agree; None when too few do.
+    """T_map_cam from points (N, 3) and their pixels (N, 2), and the inliers; None when too few agree.
 
     From `start` by robust refinement; where that fails, or without one, by sampling.
     """
@@ -131,9 +131,8 @@ def pose_of(
 
 
 _ITERATIONS, _ROUNDS = 3, 6
-"""Steps of a refinement, after which it is asked anew which points agree, until they are the same, and how often that
-is at the most. The last steps to a minimum change the error of a path by hundredths of a millimetre (research/speed
-0183)."""
+"""Steps of a refinement, after which inliers are selected again, until they no longer change, and the most such rounds.
+The last steps to a minimum change the error of a path by hundredths of a millimetre (research/speed 0183)."""
 
 
 def _refined(
@@ -144,7 +143,7 @@ def _refined(
     rows: NDArray[np.bool_],
     settings: FramePoseSettings,
 ) -> tuple[Poses, NDArray[np.bool_]] | None:
-    """Return the pose by Gauss and Newton from `start`, and which points agree; None when too few do."""
+    """Return the pose by Gauss-Newton from `start`, and the inliers; None when too few agree."""
     T_cam_map, lens = inverse(start), np.array([camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5])
     gate, scale = settings.pose_error_px * pixel_unit(camera), 0.5 * pixel_unit(camera)
     for _ in range(_ROUNDS):
@@ -168,7 +167,7 @@ def _refined(
 def _bridge(
     segment: PosedSegment, grays: Sequence[Gray], positions: Sequence[int], settings: FramePoseSettings
 ) -> None:
-    """Pose frames that lost their corners, in place, by looking for the structure that the neighbours see."""
+    """Pose frames that lost their corners, in place, by tracking the map's points that the neighbours see."""
     posed = sorted(segment.T_map_cam)
     for before, behind in pairwise(posed):
         gap = range(before + 1, behind)

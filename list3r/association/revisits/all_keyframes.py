@@ -1,8 +1,8 @@
-"""Place a chunk of one session beside one of another by all keyframes of both, where much has changed in between.
+"""Relate a chunk of one session to one of another by all keyframes of both, where much has changed in between.
 
-Few frames of a changed room in another light look alike, so every keyframe is compared with every other one. What was
-moved then supports wrong places, often with more keyframes than one; so relations that put the chunk at one place
-are taken together, and the whole of both chunks decides between the places (`chunk_agreement`, research/sessions 0134).
+Few frames of a changed room in another light are similar, so all pairs of keyframes are compared. Moved objects then
+support wrong places, often with several keyframes; so relations that place the chunk equally are grouped, and all
+keyframes of both chunks decide between the groups (`chunk_agreement`, research/sessions 0134).
 """
 
 from __future__ import annotations
@@ -14,50 +14,50 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.association.revisits.whole_chunks.chunk_agreement import (
+from list3r.association.revisits.chunk_agreement import (
     ChunkAgreement,
     ChunkAgreementSettings,
     ChunkKeyframes,
     chunk_agreement,
 )
+from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Edge, Keyframe
 
 Array = NDArray[np.float64]
 
 WITNESSED = "witnessed"
-"""Score of a relation that the whole of both chunks supports: how much of what both saw agrees, in [0, 1]."""
+"""Score of a relation that all keyframes of both chunks support: agreeing share of the common surface, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class AllKeyframesSettings:
-    """Where all keyframes of two chunks are compared, and which place is believed."""
+    """Where all keyframes of two chunks are compared, and which place is accepted."""
 
     chunks: int = 2
-    """Most chunks of other sessions that are compared with a new one, those of which frames look most alike."""
+    """Most chunks of other sessions that are compared with a new one, those with the most similar frames."""
     keyframes: int = 20
     """Most keyframes of a chunk, spread over it."""
     one_place_m: float = 0.15
-    """Two relations put the chunk at one place where the new one's keyframes lie this near, and"""
+    """Two relations are of one place where they place the new one's keyframes within this distance and"""
     one_place_deg: float = 5.0
-    """are turned by at most this."""
+    """this rotation."""
     least_seen: float = 0.08
-    """Share of either chunk's points that neither keyframe saw and the other chunk did."""
+    """Least share of either chunk's points that neither keyframe saw and the other chunk did."""
     least_agreement: float = 0.4
-    """Share of those that must lie on a surface of the other, whichever way they face (`ChunkAgreement.agreement`)."""
+    """Least share of these points on a surface of the other, for any normal (`ChunkAgreement.agreement`)."""
     contradicted: float = 0.15
-    """With less of it a relation is contradicted, whatever else supports it."""
+    """Agreement below which a relation is contradicted, whatever else supports it."""
     margin: float = 0.15
-    """By which another place must agree less."""
+    """Least lead of the agreement over that of another place."""
     kept: int = 6
-    """Most relations of the place that is believed."""
+    """Most relations of the accepted place."""
     whole: ChunkAgreementSettings = field(default_factory=ChunkAgreementSettings)
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Relations that put a chunk at one place, the best one first, and what the whole of the chunks says of that."""
+    """Relations that put a chunk at one place, the best one first, and the agreement of the chunks there."""
 
     edges: list[Edge]
     whole: ChunkAgreement
@@ -69,7 +69,7 @@ def place_by_all_keyframes(
     verification: VerificationSettings,
     settings: AllKeyframesSettings | None = None,
 ) -> list[Edge]:
-    """Return accepted relations that put chunk v of one session beside chunk u of another, none where that is unsure.
+    """Return accepted relations of chunk v of one session to chunk u of another, none where they are uncertain.
 
     `u` and `v` are chunk ids and their keyframes, with features and depth in metres.
     """
@@ -95,7 +95,7 @@ def place_by_all_keyframes(
 def contradicted(
     edge: Edge, old: Sequence[Keyframe], new: Sequence[Keyframe], settings: AllKeyframesSettings | None = None
 ) -> bool:
-    """Tell whether what the keyframes of chunks u and v saw besides those of a relation cannot be so, metres."""
+    """Return whether the keyframes of chunks u and v, without those of a relation, contradict it, metres."""
     s = settings or AllKeyframesSettings()
     if edge.frames is None:
         return False
@@ -134,5 +134,5 @@ def _asked(edges: list[Edge], u: ChunkKeyframes, v: ChunkKeyframes) -> _Place:
 
 
 def _witnessed(edge: Edge, found: ChunkAgreement) -> Edge:
-    reason = f"{edge.reason}; of what else both chunks saw {found.agreement:.0%} agrees"
+    reason = f"{edge.reason}; of the rest that both chunks saw {found.agreement:.0%} agrees"
     return replace(edge, scores=edge.scores | {WITNESSED: found.agreement}, reason=reason)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.registration import Home, judged_loops
-from list3r.association.revisits.constellations.surroundings import Neighbour, SurroundingsSettings, gather
+from list3r.association.revisits.constellations.neighbourhood import Neighbour, NeighbourhoodSettings, gather
 from list3r.association.revisits.cross_check import Side
-from list3r.association.revisits.cues import CueSettings, instance_set
+from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
 from list3r.frames.base import Camera
 from list3r.memory.geometry import Sim3, rotation_exp
 from list3r.memory.records import FrameSamples, Support
@@ -46,7 +46,7 @@ def side(nodes: list[LocalNode]) -> Side:
         camera_frames=np.arange(3),
         T_chunk_cam=poses,
     )
-    return Side(samples, CAMERA, instance_set(nodes, poses, SPACE, CueSettings()))
+    return Side(samples, CAMERA, instance_set(nodes, poses, SPACE, SimilaritySettings()))
 
 
 def blob(center: tuple[float, float, float], seed: int) -> np.ndarray:
@@ -112,7 +112,7 @@ def test_cameras_see_the_same_depths_after_gathering() -> None:
 @pytest.mark.parametrize("count", [1, 5])
 def test_surroundings_never_hold_more_instances_than_asked_for(count: int) -> None:
     nodes = [thing(k, blob((k, 0, 2), k), k) for k in range(4)]
-    few = SurroundingsSettings(most_instances=count)
+    few = NeighbourhoodSettings(most_instances=count)
     _, whole = gather([seen_from(Sim3.identity(), nodes), seen_from(GAUGE, [LAMP])], SPACE, few)
     assert len(whole.instances.local_id) == min(count, 5)
 

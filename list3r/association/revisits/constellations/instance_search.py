@@ -1,8 +1,8 @@
-"""Find loop closures by things alone, where frames that look alike join a chunk to nothing.
+"""Find loop closures by instances alone, where similar frames join a chunk to no other.
 
-What is apart from the new chunk (another session, what lies behind a jump of the picture) is matched whole; of what is
-tied to it only what lies near by as the chain of edges has it. A chunk is registered with its surroundings
-(`surroundings`), which takes half a second a pair, so it is asked only where appearance did not suffice.
+A chunk in another component (another session, or before a jump of the picture) is always matched; one in the same
+component only if the chain of edges places it near. A chunk is registered with its neighbourhood (`neighbourhood`),
+which takes half a second a pair, so only where appearance did not suffice.
 """
 
 from __future__ import annotations
@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.chain import EdgeChains
-from list3r.association.revisits.constellations.constellation import (
-    Constellation,
-    make_constellation,
-    typical_depth,
-)
-from list3r.association.revisits.constellations.matching import match_constellations
-from list3r.association.revisits.constellations.registration import (
+from list3r.association.revisits.constellations.chunk_registration import (
     ConstellationRegistrationSettings,
     RegisteredChunk,
     Registration,
@@ -29,8 +23,14 @@ from list3r.association.revisits.constellations.registration import (
     refusal,
     register,
 )
+from list3r.association.revisits.constellations.constellation import (
+    Constellation,
+    make_constellation,
+    typical_depth,
+)
+from list3r.association.revisits.constellations.matching import match_constellations
+from list3r.association.revisits.constellations.neighbourhood import Neighbour, NeighbourhoodSettings, gather
 from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
-from list3r.association.revisits.constellations.surroundings import Neighbour, SurroundingsSettings, gather
 from list3r.association.revisits.cross_check import Side
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge
@@ -41,41 +41,41 @@ _BELIEF = "things_belief"
 
 
 @dataclass(frozen=True)
-class ThingSearchSettings:
-    """Where things are asked."""
+class InstanceSearchSettings:
+    """Where instances are compared."""
 
     enabled: bool = True
     most_apart: int = 60
-    """Most chunks apart from the new one whose things are matched, spread over all of them."""
+    """Most chunks of other components whose instances are matched, spread over all of them."""
     places: int = 4
-    """Most chunks that are registered for how well their things match,"""
+    """Most chunks that are registered, those whose instances match best,"""
     registered: int = 6
-    """and most with those that surround the best ones, which tell the place once more."""
+    """and most with the neighbours of the best ones, which repeat the measurement."""
     near: float = 1.5
-    """Chunks tied to the new one are asked where they lie this near, shares of both typical depths."""
+    """Chunks of the same component are compared within this distance, shares of both typical depths."""
     most_near: int = 4
-    most_looked: int = 16
-    """Chunks whose origins lie nearest, of which it is asked how near they lie; reading all takes long."""
+    most_checked: int = 16
+    """Chunks with the nearest origins whose distance is measured; reading all takes long."""
     least_lead: float = 2.0
-    """Least difference of the log odds of a believed relation and of any that puts the new chunk elsewhere."""
+    """Least difference of the log odds of an accepted relation and of any that places the new chunk elsewhere."""
     elsewhere: float = 1.5
-    """Deviations of the way between two relations from which on they name two places. What lies in one is mostly found
-    within 0.3; look-alike rooms of one floor lie 2.7 and more apart (research/association 0147)."""
-    surroundings: SurroundingsSettings = field(default_factory=SurroundingsSettings)
+    """Deviations between two relations from which on they are of two places. Relations of one place mostly differ by
+    up to 0.3; similar rooms of one floor by 2.7 and more (research/association 0147)."""
+    neighbourhood: NeighbourhoodSettings = field(default_factory=NeighbourhoodSettings)
     registration: ConstellationRegistrationSettings = field(default_factory=ConstellationRegistrationSettings)
 
 
 @dataclass
 class _Known:
-    """Constellations of an open store, by chunk and what could change them."""
+    """Constellations of an open store, by chunk, with a key of their inputs."""
 
     by_chunk: dict[tuple[int, ...], tuple[object, Constellation]] = field(default_factory=dict)
-    """Of surroundings, by their chunks, the one in the middle first."""
+    """Of neighbourhoods, by their chunks, the central one first."""
     middles: dict[int, tuple[int | None, Array, float]] = field(default_factory=dict)
-    """Checksum, middle of the samples (3,) and typical depth of chunks, chunk units."""
+    """Checksum, centre of the samples (3,) and typical depth of chunks, chunk units."""
 
 
-class ThingSearch:
+class InstanceSearch:
     """The new chunk and the stored ones, as constellations."""
 
     def __init__(
@@ -84,7 +84,7 @@ class ThingSearch:
         rows: dict[int, ChunkRow],
         chunk_id: int,
         side: Callable[[int], Side],
-        settings: ThingSearchSettings,
+        settings: InstanceSearchSettings,
     ) -> None:
         self._store, self._rows, self._id, self._side, self._settings = store, rows, chunk_id, side, settings
         self._known = store.derived.of(_Known)
@@ -95,7 +95,7 @@ class ThingSearch:
     def edges(
         self, apart: Sequence[int], tied: Sequence[int], chains: EdgeChains, most_deviations: float
     ) -> list[Edge]:
-        """Return loop edges, accepted or rejected, to the chunks that are worth it."""
+        """Return the loop edges, accepted or rejected, to the chunks that are registered."""
         s = self._settings
         pick = np.linspace(0, len(apart) - 1, min(len(apart), s.most_apart)).astype(np.int64)
         members: dict[int, dict[int, Sim3]] = {}
@@ -130,7 +130,7 @@ class ThingSearch:
         return [self._outdone(e, out, chains) for e in out]
 
     def _places(self, likely: list[int], members: Mapping[int, Mapping[int, Sim3]], apart: Sequence[int]) -> list[int]:
-        """Return the chunks whose surroundings are registered: the likely ones, then what surrounds the likeliest."""
+        """Return the chunks whose neighbourhoods are registered: likely ones, then neighbours of the likeliest."""
         near = [n for u in likely for n in members[u] if n in apart and n not in likely]
         return list(dict.fromkeys([*likely[: self._settings.places], *near]))[: self._settings.registered]
 
@@ -149,7 +149,7 @@ class ThingSearch:
         return replace(edge, accepted=False, weight=0.0, reason=why)
 
     def _near(self, tied: Sequence[int]) -> list[int]:
-        """Return the tied chunks whose things lie nearest to those of the new one, as the neighbour's edge has it."""
+        """Return the chunks of the component whose instances are nearest to the new one's, by the neighbour's edge."""
         before = [e for e in self._store.edges.all() if e.v == self._id and e.kind == "adjacent" and e.accepted]
         if not before or not tied:
             return []
@@ -158,7 +158,7 @@ class ThingSearch:
         origins = np.array([self._rows[u].S_world_chunk.translation for u in tied])
         nearest = np.argsort(np.linalg.norm(origins - S_world_v.translation, axis=1), kind="stable")
         out = []
-        for u in (tied[k] for k in nearest[: self._settings.most_looked].tolist()):
+        for u in (tied[k] for k in nearest[: self._settings.most_checked].tolist()):
             other, also = self._middle(u, self._rows[u].S_world_chunk)
             off = float(np.linalg.norm(middle - other)) / (reach + also)
             if off <= self._settings.near / 2:
@@ -166,7 +166,7 @@ class ThingSearch:
         return [u for _, u in sorted(out)[: self._settings.most_near]]
 
     def _middle(self, chunk_id: int, S_world_chunk: Sim3) -> tuple[Array, float]:
-        """Return the middle of a chunk's samples, world, and its typical depth there."""
+        """Return the centre of a chunk's samples, world, and its typical depth there."""
         state = self._checksums.get(chunk_id)
         held = self._known.middles.get(chunk_id)
         if held is None or held[0] != state:
@@ -180,8 +180,8 @@ class ThingSearch:
         return self._rows[u].scale_kind == self._rows[self._id].scale_kind == "metric"
 
     def _members(self, chunk_id: int, without: Mapping[int, Sim3]) -> dict[int, Sim3]:
-        """Return S_here_chunk of a chunk and of its surroundings, by their ids, itself first."""
-        s = self._settings.surroundings
+        """Return S_here_chunk of a chunk and of its neighbours, by their ids, itself first."""
+        s = self._settings.neighbourhood
         out, edge = {chunk_id: Sim3.identity()}, [chunk_id]
         for _ in range(s.steps):
             step = [(k, n, S_k_n) for k in edge for n, S_k_n in self._neighbours.get(k, ()) if n not in out]
@@ -207,10 +207,10 @@ class ThingSearch:
         nodes = {n: self._store.local_instances.nodes([n]) for n in members}
         space = self._store.chunks.feature_space(next(iter(members)))
         parts = [Neighbour(S, nodes[n], self._side(n)) for n, S in members.items()]
-        things, side = gather(parts, space, s.surroundings)
+        merged, side = gather(parts, space, s.neighbourhood)
         how = s.registration.constellation
-        how = how if len(parts) == 1 else replace(how, most_instances=s.surroundings.most_instances)
-        return make_constellation(things, side, space, how), side
+        how = how if len(parts) == 1 else replace(how, most_instances=s.neighbourhood.most_instances)
+        return make_constellation(merged, side, space, how), side
 
     def _place(self, members: Mapping[int, Sim3]) -> RegisteredChunk:
         c, side = self._made(members)
@@ -223,7 +223,7 @@ class ThingSearch:
     def _edge(
         self, u: int, old: RegisteredChunk, new: RegisteredChunk, found: Registration, against: str | None
     ) -> Edge:
-        agree = f"{found.scores['pairs']:.0f} things agree on where they stand"
+        agree = f"{found.scores['pairs']:.0f} instances agree on their positions"
         confidence = float(
             np.clip(
                 found.scores["agreement"] * found.scores["fitting"] / self._settings.registration.enough_fitting,
@@ -250,7 +250,7 @@ class ThingSearch:
 
 
 def _neighbours_in_time(edges: Sequence[Edge], last: int) -> dict[int, list[tuple[int, Sim3]]]:
-    """Return the chunks up to the last one that the camera went through before and after each, and S_chunk_other."""
+    """Return the chunks just before and after each, up to the last one, in the camera's order, and S_chunk_other."""
     out: dict[int, list[tuple[int, Sim3]]] = {}
     for e in edges:
         if e.kind == "adjacent" and e.accepted and max(e.u, e.v) <= last:

@@ -1,8 +1,8 @@
-"""Whether pictures can be explained by a camera that only turns; then there is no depth in them, whatever a map says.
+"""Whether pictures can be explained by a camera that only rotates; then a map has no depth.
 
-With a focal length that is wrong, or left free, structure from motion makes a map of such pictures too. So for pairs of
-views the best rotation is asked for at focal lengths around the camera's: x_b ~ K R K^-1 x_a (Hartley and Zisserman,
-Multiple View Geometry, 8.4.2; research/colour-video 0071).
+With a wrong or free focal length, structure from motion makes a map of such pictures too. So for pairs of views the
+best rotation is fitted at focal lengths around the camera's: x_b ~ K R K^-1 x_a (Hartley and Zisserman, Multiple View
+Geometry, 8.4.2; research/colour-video 0071).
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.ranks import median, quantile
-from list3r.reconstruction.sfm.settings import TurningSettings
+from list3r.reconstruction.order_statistics import median, quantile
+from list3r.reconstruction.sfm.settings import PureRotationSettings
 
 Floats = NDArray[np.float64]
 Places = Mapping[int, NDArray[np.float32]]
-"""Where something is seen in each view, px. Shape (N, 2)."""
+"""Pixels of common points in each view. Shape (N, 2)."""
 Rows = Mapping[tuple[int, int], NDArray[np.int64]]
-"""Rows of two views that show the same, by the two views' keys, the smaller first. Shape (M, 2)."""
+"""Matching rows of two views, by the two views' keys, the smaller first. Shape (M, 2)."""
 
 
 def only_turns(
-    places: Places, pairs: Rows, keys: Collection[int], camera: Camera, settings: TurningSettings | None = None
+    places: Places, pairs: Rows, keys: Collection[int], camera: Camera, settings: PureRotationSettings | None = None
 ) -> bool:
-    """Return whether the views `keys` of one camera can be explained without it having moved."""
-    s = settings or TurningSettings()
+    """Return whether the views `keys` of one camera can be explained without translation."""
+    s = settings or PureRotationSettings()
     return turning_error(_farthest_pairs(places, pairs, keys, s), camera, s) < s.most_px
 
 
-def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settings: TurningSettings) -> float:
-    """Return what the best rotations leave at the best focal length, px of a picture 640 wide; 0 without pairs."""
+def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settings: PureRotationSettings) -> float:
+    """Return the residual of the best rotations at the best focal length, px of a picture 640 wide; 0 without pairs."""
     if not pairs:
         return 0.0
     longer = max(camera.width, camera.height)
@@ -53,9 +53,9 @@ def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settin
 
 
 def _farthest_pairs(
-    places: Places, pairs: Rows, keys: Collection[int], settings: TurningSettings
+    places: Places, pairs: Rows, keys: Collection[int], settings: PureRotationSettings
 ) -> list[tuple[Floats, Floats]]:
-    """Places of what views spread over the video share with the last one that shares enough with each."""
+    """Common pixels of views spread over the video and the last view that shares enough with each."""
     last = {}
     for (a, b), rows in sorted(pairs.items()):
         if a in keys and b in keys and len(rows) >= settings.least_matches:
@@ -65,8 +65,8 @@ def _farthest_pairs(
     return [(places[a][r[:, 0]].astype(np.float64), places[b][r[:, 1]].astype(np.float64)) for a, b, r in rows_of]
 
 
-def _pair_error(a: Floats, b: Floats, focal: float, settings: TurningSettings) -> float:
-    """Return the settings' percentile of what the best rotation between two views leaves, px."""
+def _pair_error(a: Floats, b: Floats, focal: float, settings: PureRotationSettings) -> float:
+    """Return the settings' percentile of the residual of the best rotation between two views, px."""
     rays_a, rays_b = (np.column_stack([xy, np.full(len(xy), focal)]) for xy in (a, b))
     rays_a, rays_b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (rays_a, rays_b))
     kept = np.ones(len(a), bool)

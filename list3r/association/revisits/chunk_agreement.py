@@ -1,9 +1,9 @@
-"""Ask the whole of two chunks whether a relation is true: all that their keyframes saw, of which two saw little.
+"""Test a relation on all keyframes of two chunks, not only on the two that it is from.
 
-A relation of two keyframes can rest on a thing that was moved, or that looks like another. Then walls, floor and all
-that stayed lie elsewhere: what one chunk saw lies in the free space of the other. What the two keyframes saw
-themselves is left out, so that the rest is independent evidence. Along two walls and the floor a room can be shifted
-and they still agree, so it counts how much agrees of what faces the way that agrees least (research/sessions 0134).
+A relation of two keyframes can be based on an object that was moved or that is similar to another. Then the static
+surfaces of one chunk are in the free space of the other. The surfaces that the two keyframes saw are left out, so that
+the rest is independent evidence. A room shifted along two walls and the floor still agrees with them, so the agreement
+of the surface direction that agrees least counts (research/sessions 0134).
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class ChunkAgreementSettings:
-    """When the whole of two chunks supports a relation."""
+    """When all keyframes of two chunks support a relation."""
 
     points: int = 400
-    """Most points of a keyframe that are looked for in the other chunk."""
+    """Most points of a keyframe that are compared with the other chunk."""
     met_m: float = 0.02
-    """A point lies on a surface within this and"""
+    """A point is on a surface within this and"""
     met_sigmas: float = 2.0
     """this many deviations of the sensor's noise, where both"""
     least_cosine: float = 0.8
-    """have about one direction."""
+    """have at least this cosine of the normals."""
     through_m: float = 0.05
-    """A point is seen through where depth lies further behind it than this and"""
+    """A point is seen through where depth is farther behind it than this and"""
     through_sigmas: float = 3.0
     """this many deviations."""
     near_m: float = 0.1
-    """Nearer points are not looked at."""
+    """Nearer points are ignored."""
     prior: float = 0.02
-    """Share of all that was seen that is taken to face every way besides, and to agree as all of it does on average:
-    a few points say nothing."""
+    """Pseudo-count, as a share of all seen points, of points of every direction and of average agreement: a few points
+    are no evidence."""
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
 @dataclass(frozen=True)
 class ChunkAgreement:
-    """What the whole of two chunks says of a relation."""
+    """Agreement of two chunks under a relation."""
 
     seen: float
     """Share of a chunk's points that the other chunk saw, the smaller of the two, in [0, 1]."""
     agreement: float
-    """Of those the share that lies on a surface, of what faces the way in which the least does; the smaller of the two,
-    in [0, 1]."""
+    """Share of these points on a surface, for the normal direction of the least share; the smaller of the two, in
+    [0, 1]."""
 
 
 class ChunkKeyframes:
@@ -73,13 +73,13 @@ class ChunkKeyframes:
         """Unit length. Shape (N, 3)."""
 
     def seen_by(self, frame: int) -> Mask:
-        """Tell which points lie on a surface that one keyframe (Frame.index) saw. Shape (N,)."""
+        """Return which points are on a surface that one keyframe (Frame.index) saw. Shape (N,)."""
         return self._fares(self.points, self.normals, *self._views[frame])[0]
 
     def fare(self, points: Array, normals: Array) -> tuple[Mask, Mask]:
-        """Tell which points (N, 3) were seen here, and which of them lie on a surface, chunk coordinates.
+        """Return which points (N, 3) were seen here, and which of them are on a surface, chunk coordinates.
 
-        A point counts by what most of the keyframes say that can tell. Shapes (N,).
+        The majority of the keyframes that see a point decides. Shapes (N,).
         """
         met, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
         for view, T in self._views.values():
@@ -88,7 +88,7 @@ class ChunkKeyframes:
         return seen > 0, (met > 0) & (2 * met >= seen)
 
     def _fares(self, points: Array, normals: Array, view: WorkingFrame, T_chunk_cam: Array) -> tuple[Mask, Mask]:
-        """Tell which points lie on what a view saw, and which lie there or before it. Shapes (N,)."""
+        """Return which points are on a surface of a view, and which are there or in front of it. Shapes (N,)."""
         s, camera = self._settings, view.camera
         p = (points - T_chunk_cam[:3, 3]) @ T_chunk_cam[:3, :3]
         z = np.maximum(p[:, 2], 1e-3)
@@ -110,7 +110,7 @@ class ChunkKeyframes:
 
 
 def chunk_agreement(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: tuple[int, int]) -> ChunkAgreement:
-    """Return what two chunks say of a relation (4, 4) of two keyframes (Frame.index of u and of v), metres."""
+    """Return the agreement of two chunks under a relation (4, 4) of two keyframes (Frame.index of u and v), metres."""
     T_u_v = np.linalg.inv(T_v_u)
     shares = []
     for source, target, T, frame in ((u, v, T_v_u, frames[0]), (v, u, T_u_v, frames[1])):
@@ -122,8 +122,8 @@ def chunk_agreement(T_v_u: Array, u: ChunkKeyframes, v: ChunkKeyframes, frames: 
 
 
 def _least_share(normals: Array, seen: Mask, met: Mask, prior: float) -> float:
-    """Return the least share that is met of what is seen, over all ways that a surface faces: of directions d the least
-    sum of (n d)^2 over normals n (N, 3) that are met by that over those that are seen."""
+    """Return the least share of met among seen points over all normal directions: over d the least ratio of the sums of
+    (n d)^2 over normals n (N, 3), met over seen."""
     if not met.any():
         return 0.0
     all_seen, all_met = (normals[which].T @ normals[which] for which in (seen, met))

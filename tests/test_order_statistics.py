@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.reconstruction.ranks import median, medians, quantile
+from list3r.reconstruction.order_statistics import median, medians, quantile
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 50, 301])

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from list3r.association.revisits.session_ties import hold_back
-from list3r.association.revisits.verification import VerificationSettings
-from list3r.association.revisits.whole_chunks.all_keyframes import (
+from list3r.association.revisits.all_keyframes import (
     WITNESSED,
     contradicted,
     place_by_all_keyframes,
 )
-from list3r.association.revisits.whole_chunks.chunk_agreement import (
+from list3r.association.revisits.chunk_agreement import (
     ChunkAgreementSettings,
     ChunkKeyframes,
     chunk_agreement,
 )
+from list3r.association.revisits.session_edges import defer_session_edges
+from list3r.association.revisits.verification import VerificationSettings
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.records import Edge, Keyframe
 from tests.session_scenes import FOCAL, Box, cast
@@ -90,7 +90,7 @@ def _off(S_v_u: Sim3) -> float:
 def test_what_stayed_places_a_session_though_a_large_thing_that_moved_says_otherwise() -> None:
     found = _placed(_keyframes(True, True, GAUGE, 1))
     assert found and all(e.accepted and _off(e.S_v_u) < 0.03 for e in found)
-    assert hold_back(found[:1], {1: 1, 2: 2})[0].accepted
+    assert defer_session_edges(found[:1], {1: 1, 2: 2})[0].accepted
     assert found[0].scores[WITNESSED] > 0.8
 
 

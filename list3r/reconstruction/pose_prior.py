@@ -1,4 +1,4 @@
-"""Poses that are given but imperfect: where they jump, and how a chunk lies in their world."""
+"""Poses that are given but imperfect: their jumps, and the transform from a chunk to their world."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """How far given poses are believed from one frame to the next."""
+    """Uncertainty of given poses from one frame to the next."""
 
     shift_m: float = 0.002
-    """Deviation of a step, metres; what visual-inertial odometry jitters by."""
+    """Standard deviation of a step, metres; the jitter of visual-inertial odometry."""
     shift_share: float = 0.02
-    """Deviation of a step by its length: twice the drift that ARKit is known for."""
+    """Standard deviation of a step by its length: twice the drift that ARKit is known for."""
     turn_deg: float = 0.1
-    """Deviation of the turn of a step."""
+    """Standard deviation of the rotation of a step."""
     correlated: float = 30.0
-    """So many of a picture's pairs tell as much as one: neighbours err alike."""
+    """Number of a picture's pairs that count as one: errors of neighbours are correlated."""
     jump_m: float = 0.04
-    """What a pose moves against what depth shows from one frame to the next is a jump beyond this,"""
+    """Difference between a pose's step and the step that depth shows beyond which it is a jump,"""
     jump_deg: float = 1.5
-    """or beyond this turn."""
+    """or the same of the rotation."""
     jump_inliers: float = 0.9
-    """A frame that contradicts its step by so much is believed with this share of the usual inliers,"""
+    """A frame that contradicts its step by that much is accepted with this share of the usual inliers,"""
     jump_correlation: float = 0.8
     """and this correlation of brightness: true jumps have 0.98, blurred pictures of a bare floor 0.5 to 0.7."""
 
@@ -63,7 +63,7 @@ def steady_runs(T_chunk_cam: Poses, T_source_cam: Poses, settings: PriorSettings
 
 
 def mean_alignment(T_chunk_cam: Poses, T_source_cam: Poses) -> Poses:
-    """Return T_source_chunk (4, 4) that lays cameras on their given poses, on average. Both have shape (F, 4, 4)."""
+    """Return T_source_chunk (4, 4) that aligns cameras to their given poses, on average. Both have shape (F, 4, 4)."""
     U, _, Vt = np.linalg.svd((T_source_cam[:, :3, :3] @ T_chunk_cam[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     out = np.eye(4)
     out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
@@ -88,10 +88,10 @@ def source_from_chunk(
 def bridged(
     T_chunk_cam: Poses, posed: NDArray[np.bool_], T_source_cam: Poses, settings: PriorSettings
 ) -> tuple[Poses, NDArray[np.bool_]]:
-    """Return the poses with those of frames that show nothing, by the given steps, and which frames have one.
+    """Return the poses with those of lost frames, by the given steps, and which frames have one.
 
-    Between two frames that were followed what the given steps miss the later one by is spread over them; where that is
-    a jump they are left out, for nothing tells when it was. Shapes (F, 4, 4), (F,), (F, 4, 4).
+    Between two tracked frames the given steps' error at the later one is spread over them; where that is a jump they
+    are left out, because its time is unknown. Shapes (F, 4, 4), (F,), (F, 4, 4).
     """
     T, known = T_chunk_cam.copy(), posed.copy()
     followed = np.flatnonzero(posed & np.isfinite(T_source_cam).all(axis=(1, 2)))

@@ -1,7 +1,7 @@
 """Medians and quantiles of a few hundred known values: those of NumPy, bit for bit.
 
-NumPy's own ask for much that does not matter here (axes, NaN, kinds of interpolation), thousands of times a chunk. Of
-600 values a quantile takes a sixteenth of their time, a median a sixth, medians of three columns a quarter.
+NumPy's own handle much that is not needed here (axes, NaN, kinds of interpolation), thousands of times a chunk. Of 600
+values a quantile takes a sixteenth of their time, a median a sixth, medians of three columns a quarter.
 """
 
 from __future__ import annotations

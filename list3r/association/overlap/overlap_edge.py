@@ -1,7 +1,7 @@
 """Measure the relation of two chunks that share frames (paper 3.2, instance-aware subsequence merging).
 
-Shared pixels, without regions that move, spread evenly over space and instances, then aligned. The same code serves
-adjacent chunks and both halves of a loop (chunk u against the window, the window against chunk v).
+Shared pixels without moving regions, spread evenly over space and instances, are aligned. The same code serves adjacent
+chunks and both halves of a loop (chunk u against the window, the window against chunk v).
 """
 
 from __future__ import annotations
@@ -28,42 +28,42 @@ class EdgeSettings:
     """How an edge is measured."""
 
     instance_aware: bool = True
-    """Whether regions that move leave the support; otherwise an edge stands on all pairs that are confident enough."""
+    """Whether moving regions leave the support; otherwise all pairs with enough confidence are used."""
     least_pairs: int = 60
-    """Fewest pairs that an edge stands on."""
+    """Fewest pairs of an edge."""
     least_inliers: float = 0.3
     """Least share of the weight within three residual scales for an edge to be accepted."""
     most_moving: float = 0.9
-    """Largest share of the confident pairs that may move in an accepted edge."""
+    """Largest moving share of the confident pairs in an accepted edge."""
     trial_pairs: int = 1500
-    """Pairs that a trial alignment works on."""
+    """Pairs of a trial alignment."""
     support: EdgeSupportSettings = field(default_factory=EdgeSupportSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
 
 
 @dataclass(frozen=True)
 class EdgeSupport:
-    """What became of the N pairs of an edge, for pictures."""
+    """The masks of the N pairs of an edge, for pictures."""
 
     frame: NDArray[np.int64]
     """Frame.index. Shape (N,)."""
     pixel: NDArray[np.int64]
     """Row-major number in the colour image. Shape (N,)."""
     confident: Mask
-    """What confidence alone would take. Shape (N,)."""
+    """Pairs with enough confidence. Shape (N,)."""
     removed: Mask
-    """On a region that moves. Shape (N,)."""
+    """On a moving region. Shape (N,)."""
     kept: Mask
-    """What the edge stands on. Shape (N,)."""
+    """Pairs that the edge uses. Shape (N,)."""
 
 
 @dataclass(frozen=True)
 class MeasuredEdge:
-    """An edge, and what it stands on."""
+    """An edge and its support."""
 
     edge: Edge
     moving_u: frozenset[int]
-    """Local ids of chunk u that plainly move; what is merely inconsistent leaves the support without being named."""
+    """Local ids of chunk u that plainly move; merely inconsistent ones leave the support without being named."""
     moving_v: frozenset[int]
     """Local ids of chunk v that plainly move."""
     support: EdgeSupport
@@ -76,7 +76,7 @@ class EdgeEnd:
     chunk_id: int
     samples: FrameSamples
     dynamic: Collection[int] = ()
-    """Local ids of instances that are known to move (`motion.flag_dynamic`), which are left out."""
+    """Local ids of instances known to move (`motion.flag_dynamic`), which are left out."""
 
 
 def measure_edge(
@@ -91,7 +91,7 @@ def measure_edge(
     """Measure the edge between two chunks that share frames, a rigid one when `metric`.
 
     `camera` is that of the colour images. Raises `DegenerateError` where the shared points determine no transform; an
-    edge that they determine but do not agree on is returned with `accepted` false and the reason.
+    edge whose points do not agree is returned with `accepted` false and the reason.
     """
     chosen = settings or EdgeSettings()
     try:
@@ -113,7 +113,7 @@ def measure_edge(
 def _aligned(
     pairs: Pairs, known: Mask, camera: Camera, metric: bool, settings: EdgeSettings
 ) -> tuple[StaticSupport, BalancedSupport, Alignment]:
-    """Choose what an edge stands on and align it; without instances where they leave too little."""
+    """Choose the support of an edge and align it; without instances where they leave too little."""
     if settings.instance_aware:
         static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
         support = balanced_support(pairs, static, camera, settings.support)
@@ -130,7 +130,7 @@ def _aligned(
 
 
 def align_support(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
-    """Align what an edge stands on. `benchmarks/association.py` puts a plain alignment in its place."""
+    """Align the support of an edge. `benchmarks/association.py` replaces it by a plain alignment."""
     s = support
     return align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment)
 
@@ -151,7 +151,7 @@ def _trial_fit(metric: bool, settings: EdgeSettings) -> Fit:
 
 
 def _confident_support(pairs: Pairs, settings: EdgeSupportSettings) -> tuple[StaticSupport, BalancedSupport]:
-    """Return all pairs that confidence alone would take, weighted by their confidence."""
+    """Return all pairs with enough confidence, weighted by their confidence."""
     sure = confident(pairs, settings)
     none = np.zeros(len(pairs), bool)
     nobody: frozenset[int] = frozenset()
@@ -174,13 +174,13 @@ def _edge(
         f"{found.inliers} of {len(support.weight)} points of {shared_frames} shared frames agree to {found.rms:.4f}"
     )
     if static.removed.any():
-        reason += f"; {moving:.0%} of what is shared moves and was left out"
+        reason += f"; {moving:.0%} of the shared points move and were left out"
     accepted = True
     if found.close < settings.least_inliers:
         width = 3 * settings.alignment.residual_scale * found.spread
-        reason, accepted = f"{reason}; only {found.close:.0%} of the weight lies within {width:.3f}", False
+        reason, accepted = f"{reason}; only {found.close:.0%} of the weight is within {width:.3f}", False
     elif moving > settings.most_moving:
-        reason, accepted = f"{reason}; too little stands still", False
+        reason, accepted = f"{reason}; too little is static", False
     return Edge(
         u=chunk_ids[0],
         v=chunk_ids[1],
