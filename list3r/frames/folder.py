@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import (
     clean_depth,
     fault_of,
@@ -36,7 +37,7 @@ from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
-from list3r.frames.unread import not_read
+from list3r.frames.unread import not_read, not_read_note
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
@@ -355,6 +356,9 @@ class FolderSource(Reader):
                 f"the pictures use {self._bits} of their 16 bits; these are taken as the full range of brightness",
             )
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
+        left = not_read(root, layout.kind, self._some_files(), layout.read)
+        if self._options.kind == "auto":
+            refuse_left(root, left, depth=self._has_depth, poses=has_poses, camera=rig.camera is not None)
         separate = rig.registration
         if layout.z_up and turns is None and len(layout.files.that_hold(POSE_FILE | POSE)):
             notes = (*notes, NOT_STANDING)
@@ -372,7 +376,7 @@ class FolderSource(Reader):
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
-            notes=(*layout.notes, *notes, *not_read(root, layout.kind, self._some_files())),
+            notes=(*layout.notes, *notes, *not_read_note(left)),
             missing=tuple(missing),
             image_size=rig.color_size,
             stored_size=rig.stored_size,

@@ -23,6 +23,7 @@ KINDS = (
     "record3d",
     "stray",
     "polycam",
+    "scannerapp",
     "arkitscenes",
     "scannet",
     "scannetpp",

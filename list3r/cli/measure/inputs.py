@@ -42,12 +42,17 @@ def scale_of(path: Path) -> str:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """The poses of a TUM file, a memory, or a source. Says on standard error what a memory leaves out."""
+    """The poses of a file, a memory, or a source. Says on standard error what is left out."""
     from list3r.evaluation.trajectory import read_tum
 
     if is_source(path):
         return _given(path)
-    return _stored(path) if is_database(path) else read_tum(path)
+    if is_database(path):
+        return _stored(path)
+    found = read_tum(path)
+    for text in found.notes:
+        note(f"note: {text}")
+    return found
 
 
 def _stored(path: Path) -> Trajectory:

@@ -20,7 +20,7 @@ from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
-from list3r.frames.unread import not_read
+from list3r.frames.unread import not_read, not_read_note
 from list3r.memory.errors import FrameError
 
 _FRAMES_TRIED = 12
@@ -150,7 +150,7 @@ class VideoWithDepth(Reader):
                 *self._doubts(),
                 *((NOT_STANDING,) if parts.z_up and parts.poses and turns is None else ()),
                 *lying_note(turns or 0),
-                *not_read(root, parts.kind, self._some_files()),
+                *not_read_note(not_read(root, parts.kind, self._some_files())),
             ),
             missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=turns is not None,
