@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.frames.files import MAX_TEXT_BYTES
 from list3r.frames.beside import listed
+from list3r.frames.files import MAX_TEXT_BYTES
 from list3r.frames.layout import IMAGE_ENDINGS, VARIES, FolderLayout, Optics, read_json, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
