@@ -29,6 +29,7 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal
+from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
 from list3r.frames.deferred import LazyFrame
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
@@ -79,7 +80,7 @@ class FolderSource(Reader):
         if fractions and self._typical_raw <= _MOST_M:  # larger numbers with fractions are in the layout's unit
             self.optics = optics = replace(optics, depth_scale=1.0)
             notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale changes that")
-        self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side)
+        self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side, self._shown_part(root))
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
@@ -234,6 +235,29 @@ class FolderSource(Reader):
                 reason = reason or str(error)
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
 
+    def _shown_part(self, root: Path) -> Shown | None:
+        """Return the part of pictures without depth that is no black bar. Raises `SourceError` for panoramas."""
+        files, chosen = self._layout.files, self._chosen
+        if (
+            self._has_depth
+            or self._layout.kind == "live"
+            or any(files[k].lens is not None for k in (0, len(files) - 1))
+        ):
+            return None
+        numbers = np.unique(np.linspace(0, len(chosen) - 1, LOOKED_AT).astype(int))
+        pictures = self._decodable(files[int(chosen.starts[k])] for k in numbers.tolist())
+        first = next(pictures, None)
+        if first is None:
+            return None
+        if self.optics.intrinsics is None:
+            check_no_panorama([first], str(root))
+        return shown_part(chain([first], pictures))
+
+    def _decodable(self, files: Iterable[FrameFile]) -> Iterator[NDArray[np.uint8]]:
+        for file in files:
+            with contextlib.suppress(FrameError):
+                yield self._color(file)
+
     def _doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with depth, poses and times."""
         return (
@@ -348,7 +372,9 @@ class FolderSource(Reader):
         notes = (*notes, *self._doubts())
         guess, turns = self._camera_guess(), self._turns()
         missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
-        if rig.color_size != rig.stored_size:
+        if rig.shown is not None:
+            notes = (*notes, shown_note(rig.shown, rig.stored_size))
+        if rig.color_size != rig.shown_size:
             notes = (*notes, reduced_note(rig))
         if self._bits < 16:
             notes = (
@@ -379,7 +405,8 @@ class FolderSource(Reader):
             notes=(*layout.notes, *notes, *not_read_note(left)),
             missing=tuple(missing),
             image_size=rig.color_size,
-            stored_size=rig.stored_size,
+            stored_size=rig.shown_size,
+            corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),
             camera_guess=guess,
             poses_metric=layout.poses_metric,
             z_up=turns is not None,
@@ -426,14 +453,14 @@ def without_depth(deep: Sequence[int] | NDArray[np.int64], total: int) -> str:
 
 def centred_camera(focal: float, rig: Rig) -> Camera:
     """Return a camera with its centre in the middle, for a focal length in px of the pictures as stored."""
-    height, width = rig.stored_size
+    height, width = rig.shown_size
     stored = Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
     return stored.resized(*rig.color_size)
 
 
 def reduced_note(rig: Rig) -> str:
     """That frames are smaller than stored, for people."""
-    (h, w), (height, width) = rig.stored_size, rig.color_size
+    (h, w), (height, width) = rig.shown_size, rig.color_size
     return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side changes that (0: never)"
 
 

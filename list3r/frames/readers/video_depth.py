@@ -56,7 +56,7 @@ class VideoWithDepth(Reader):
         side = WORKING_SIDES[True] if options.max_side is None else options.max_side
         words = replace(options, kind="auto", intrinsics=parts.intrinsics, max_side=side, depth_scale=None)
         given = options.intrinsics is not None
-        self._video, self._parts = VideoSource(parts.video, words, by_user=given), parts
+        self._video, self._parts = VideoSource(parts.video, words, by_user=given, whole=True), parts
         stored = self._video.stored_size
         scale = options.depth_scale or parts.units_per_m
         lens = options.distortion or ()
