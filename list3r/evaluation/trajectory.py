@@ -165,8 +165,8 @@ def on_one_clock(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, T
     matched = len(other.time_s) == len(timed.time_s) or other.notes
     if timed.notes or not matched or other.time_s[-1] >= len(timed.time_s):
         raise OptionError(
-            f"one trajectory has {len(other.time_s)} rows without times, the other {len(timed.time_s)} with times; give "
-            "both with times (TUM), or as many rows"
+            f"one trajectory has {len(other.time_s)} rows without times, the other {len(timed.time_s)} with times; "
+            "give both with times (TUM), or as many rows"
         )
     placed = replace(other, time_s=timed.time_s[other.time_s.astype(np.int64)], counted=False)
     return (placed, estimate) if truth.counted else (truth, placed)

@@ -133,7 +133,8 @@ def _by_role(folder: Path) -> dict[Role, list[Path]]:
     ]
     if not out["color"]:
         depth = out["depth"] and (role_of(folder.name) == "depth" or is_deep(out["depth"][0]))
-        single = [role for role in ("confidence", "mask", "depth") if out[role]]
+        others: tuple[Role, ...] = ("confidence", "mask", "depth")
+        single = [role for role in others if out[role]]
         if len(single) == 1 and not depth:
             out["color"], out[single[0]] = out[single[0]], []
     return out
@@ -267,10 +268,10 @@ def _by_list(path: Path, colors: Sequence[Path], others: Sequence[Path]) -> Pair
 _TEXTS = (".txt", ".json", ".xml", ".yaml", ".yml", ".csv", ".md")
 
 
-def refuse_left(root: Path, left: Iterable[str], *, depth: bool, poses: bool, camera: bool) -> None:
+def refuse_left(root: Path, kind: str, left: Iterable[str], *, depth: bool, poses: bool, camera: bool) -> None:
     """Raise `SourceError` where `left`, what no reader took, looks like depth, poses or a camera that the source lacks.
 
-    `depth`, `poses`, `camera`: whether it has them.
+    `depth`, `poses`, `camera`: whether it has them; who names the `kind` goes on without.
     """
     for name in left:
         base = name.rstrip("/").rsplit("/", 1)[-1]
@@ -284,5 +285,5 @@ def refuse_left(root: Path, left: Iterable[str], *, depth: bool, poses: bool, ca
             continue
         raise SourceError(
             f"{root}: {name} looks like {what} of these pictures in a form that is not read; give {wanted}, or use "
-            "--kind images to go on without it"
+            f"--kind {kind} to go on without it"
         )

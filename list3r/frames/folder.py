@@ -31,6 +31,7 @@ from list3r.frames.decoding.decode import (
 from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
 from list3r.frames.deferred import LazyFrame
+from list3r.frames.files import picture_size
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
@@ -48,6 +49,8 @@ _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
 _POSES_TRIED = 50
 _FILES_TRIED = 12
+_SIZES_LOOKED_AT = 500
+"""Pictures whose size is looked at, by their heads."""
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
 NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `confidence` belong to this recording?"
@@ -229,6 +232,12 @@ class FolderSource(Reader):
                     return color.shape[:2], None
                 if file.depth is not None:
                     raw = read_raw_depth(file.depth)
+                    if raw.dtype == np.uint8:
+                        raise SourceError(
+                            f"{root}: depth images like {file.depth.name} have 8 bits, 255 steps, as pictures of depth "
+                            "for people have; export depth with 16 bits, or use --kind images on the pictures' folder "
+                            "to take colour alone"
+                        )
                     self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
                     return color.shape[:2], raw.shape
             except FrameError as error:
@@ -285,10 +294,18 @@ class FolderSource(Reader):
             )
         tried = np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round()).astype(int).tolist()
         some = [files[k] for k in tried if k not in empty]
+        sizes = Counter(size for k in _spread(len(files), _SIZES_LOOKED_AT) if (size := picture_size(files[k].color)))
+        if len(sizes) > 1:
+            (usual, most), total = sizes.most_common(1)[0], sum(sizes.values())
+            others = ", ".join(f"{w}x{h}" for w, h in [s for s, _ in sizes.most_common(4)][1:])
+            out.append(
+                f"{total - most} of {total} pictures looked at are of another size ({others}) than most "
+                f"({usual[0]}x{usual[1]}) and cannot be used"
+            )
         faults = [found for f in some if (found := fault_of(f.color) or (fault_of(f.depth) if f.depth else None))]
         if faults:
             out.append(f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]})")
-        return tuple(f"{found}; is the copy complete?" for found in out)
+        return tuple(found if "size" in found else f"{found}; is the copy complete?" for found in out)
 
     def _scale_doubts(self) -> tuple[str, ...]:
         """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
@@ -384,7 +401,7 @@ class FolderSource(Reader):
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
         left = not_read(root, layout.kind, self._some_files(), layout.read)
         if self._options.kind == "auto":
-            refuse_left(root, left, depth=self._has_depth, poses=has_poses, camera=rig.camera is not None)
+            refuse_left(root, layout.kind, left, depth=self._has_depth, poses=has_poses, camera=rig.camera is not None)
         separate = rig.registration
         if layout.z_up and turns is None and len(layout.files.that_hold(POSE_FILE | POSE)):
             notes = (*notes, NOT_STANDING)
@@ -437,6 +454,10 @@ class FolderSource(Reader):
         picture = self._first_picture
         focal = exif_focal(picture) if self._rig.camera is None and isinstance(picture, Path) else None
         return None if focal is None else centred_camera(focal, self._rig)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist() if count else []
 
 
 def without_pose(count: int, total: int) -> str:

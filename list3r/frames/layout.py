@@ -207,7 +207,10 @@ def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
 
 
 def inside(root: Path, name: str, stated_in: Path) -> Path:
-    """Return the path of a name within a folder, also as Windows writes it. Raises `SourceError` for one that leads out."""
+    """Return the path of a name, also as Windows writes it, within a folder.
+
+    Raises `SourceError` for one that leads out of it.
+    """
     path = root / name.replace("\\", "/")
     led = path.name == ".." or path.is_symlink()
     if not (path.resolve().is_relative_to(root.resolve()) if led else _lies_in(path.parent, root)):

@@ -57,8 +57,8 @@ _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp
 _OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
 _SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _WANTED = (
-    "give a video file, a recording of Record3D (.r3d), Stray Scanner, 3D Scanner App, Polycam or ScanNet (.sens), a ROS bag or mcap, "
-    "a recording of Aria (.vrs), a data set of LeRobot, "
+    "give a video file, a recording of Record3D (.r3d), Stray Scanner, 3D Scanner App, Polycam or ScanNet (.sens), a "
+    "ROS bag or mcap, a recording of Aria (.vrs), a data set of LeRobot, "
     "a folder in ARKitScenes, nerfstudio (transforms.json), COLMAP, 7-Scenes, TUM RGB-D or Replica layout, or of images"
 )
 

@@ -154,9 +154,7 @@ def open_container(path: Path, words: dict[str, str]) -> Any:
 
 
 def picture_stream(container: Any) -> Any | None:
-    """Return the video stream to read, the largest of colour; None where there is none; the cover of a piece of music is
-    none.
-    """
+    """Return the video stream to read, the largest of colour; None where there is none; a cover of music is none."""
     return next(iter(_picture_streams(container)), None)
 
 
@@ -171,7 +169,7 @@ def _picture_streams(container: Any) -> list[Any]:
 
 def _is_deep(stream: Any) -> bool:
     """Whether a stream holds depth or infrared: by its title, or one number of over 8 bits a pixel."""
-    parts = getattr(stream.codec_context.format, "components", ())
+    parts: Any = getattr(stream.codec_context.format, "components", ())
     return _said_deep(stream) or (len(parts) == 1 and int(parts[0].bits) > 8)
 
 

@@ -113,7 +113,7 @@ def _poses(root: Path, colors: Sequence[Path], times_s: NDArray[np.float64] | No
 def _of_pictures(
     path: Path, listed: PoseList, count: int, times_s: NDArray[np.float64] | None
 ) -> list[NDArray[np.float64] | None]:
-    """The poses at the pictures' times, or row by row where there are as many. Raises `SourceError` where neither is."""
+    """The poses at the pictures' times, or row by row where there are as many. Raises `SourceError` for others."""
     if listed.time_s is not None and times_s is not None and listed.known.any():
         rows = np.flatnonzero(listed.known)
         rows = rows[np.argsort(listed.time_s[rows], kind="stable")]

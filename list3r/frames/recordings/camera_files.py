@@ -87,7 +87,7 @@ def _of_file(path: Path, name: str) -> StatedCamera | None:
 def _of_table(name: str, content: Mapping[str, Any]) -> StatedCamera | None:
     """A camera of JSON, at its top or in the first table in it that has one."""
     values = next(([content[k] for k in names] for names in _FOUR if all(k in content for k in names)), None)
-    matrix = next((content[k] for k in _MATRICES if isinstance(content.get(k), list)), None)
+    matrix: Any = next((content[k] for k in _MATRICES if isinstance(content.get(k), list)), None)
     if values is None and matrix is None:
         inner = (_of_table(name, v) for v in content.values() if isinstance(v, dict))
         return next((c for c in inner if c is not None), None)

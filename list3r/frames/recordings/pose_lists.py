@@ -35,7 +35,7 @@ class PoseList:
     @property
     def known(self) -> NDArray[np.bool_]:
         """Rows that state a pose. Shape (N,)."""
-        return np.isfinite(self.T).all(axis=(1, 2))
+        return np.asarray(np.isfinite(self.T).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,12 @@ class _Row:
 
 
 def read_pose_list(path: Path, *, timed: bool = False) -> PoseList:
-    """Return the poses of a file; with `timed` positions and quaternions need a time. Raises `SourceError`, which names the line, for one that holds anything else.
+    """Return the poses of a file; with `timed` positions and quaternions need a time.
 
     Rows are `time_s tx ty tz qx qy qz qw` (TUM, a ninth number is not read), the same without a time, with commas and
     nanoseconds `time tx ty tz qw qx qy qz` (EuRoC), 12 or 16 numbers of a matrix (KITTI), or matrices of four rows,
-    each with a line of numbers before it (the logs of Redwood) or without.
+    each with a line of numbers before it (the logs of Redwood) or without. Raises `SourceError`, which names the line,
+    for anything else.
     """
     header, rows = "", list[_Row]()
     for line, words, commas in _worded(path):

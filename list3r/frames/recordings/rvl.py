@@ -1,7 +1,7 @@
 """Depth packed by RVL, as `compressed_depth_image_transport` writes it.
 
-Wilson, "Fast lossless depth image compression", ISS 2017: runs of zeros and of differences to the last known pixel, each
-number in groups of three bits, the lowest first, with a fourth that says whether more follow.
+Wilson, "Fast lossless depth image compression", ISS 2017: runs of zeros and of differences to the last known pixel,
+each number in groups of three bits, the lowest first, with a fourth that says whether more follow.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from list3r.memory.errors import FrameError
 
 
 def read_rvl(data: bytes) -> NDArray[np.uint16]:
-    """Return depth as stored from width, height (32 bits each) and what is packed. Shape (H, W). Raises `FrameError`."""
+    """Return depth as stored of width, height (32 bits each) and what is packed. Shape (H, W). Raises `FrameError`."""
     width, height = struct.unpack("<ii", data[:8]) if len(data) >= 8 else (0, 0)
     if min(width, height) < 1 or width * height > MAX_PIXELS:
         raise FrameError(f"depth packed by RVL claims {width}x{height} pixels; is it damaged?")
