@@ -98,7 +98,7 @@ def look(root: Path, *, alone: bool = False) -> Found | None:
     folders = {p: _by_role(p) for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")}
     folder = root if own["color"] else _color_folder(root, folders)
     if folder is None:
-        if own["depth"] and all(map(is_deep, own["depth"][:9])):
+        if own["depth"] and _all_deep(own["depth"]):
             raise SourceError(f"{root} holds depth images and no pictures; give the folder that holds both")
         return None
     if folder == root and not alone and (deeper := _of_parent(root)):
@@ -107,8 +107,9 @@ def look(root: Path, *, alone: bool = False) -> Found | None:
             "images to take colour alone"
         )
     inside = own if folder == root else folders[folder]
-    depths = inside["depth"] or _folder_of("depth", folders)
-    confidences = inside["confidence"] or _folder_of("confidence", folders)
+    others = {p: held for p, held in folders.items() if p != folder}
+    depths = inside["depth"] or _folder_of("depth", others)
+    confidences = inside["confidence"] or _folder_of("confidence", others)
     masks = len(inside["mask"])
     notes = (f"{masks} images beside the pictures are named as masks and not read",) if masks else ()
     return Found(inside["color"], depths, confidences, notes)
@@ -145,7 +146,9 @@ _MOST_LOOKED_AT = 20_000
 
 def _color_folder(root: Path, folders: Mapping[Path, Mapping[Role, list[Path]]]) -> Path | None:
     """The folder of pictures: the one named as such, or the only one beside depth whose name says nothing."""
-    full = [p for p, held in folders.items() if held["color"]]
+    full = [p for p, held in folders.items() if held["color"] and not _all_deep(held["color"])] or [
+        p for p, held in folders.items() if held["color"]
+    ]
     named = [p for name in _FIRST_FOLDERS for p in full if p.name.lower() == name]
     named = named or [p for p in full if role_of(p.name) == "color"]
     if named:
@@ -162,6 +165,8 @@ def _folder_of(role: Role, folders: Mapping[Path, Mapping[Role, list[Path]]]) ->
         p: [q for held in images.values() for q in held] for p, images in folders.items() if role_of(p.name) == role
     }
     found = {p: listed(p, _DEPTH_ENDINGS) for p in found if found[p]}
+    if role == "depth" and not found:  # whatever it is called
+        found = {p: held["color"] for p, held in folders.items() if held["color"] and _all_deep(held["color"])}
     plain = [p for p in found if p.name.lower() in _WORDS[role]] or [p for p in found if _REGISTERED.search(p.name)]
     if len(found) > 1 and len(plain) != 1:
         names = ", ".join(p.name for p in found)
@@ -169,6 +174,11 @@ def _folder_of(role: Role, folders: Mapping[Path, Mapping[Role, list[Path]]]) ->
     return found[plain[0] if plain else next(iter(found))] if found else []
 
 
+def _all_deep(images: list[Path]) -> bool:
+    return all(map(is_deep, images[:_SAMPLED]))
+
+
+_SAMPLED = 9
 _REGISTERED = re.compile("regist|align", re.IGNORECASE)
 
 

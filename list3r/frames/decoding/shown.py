@@ -78,14 +78,15 @@ def _sure(brightest: NDArray[np.uint8], axis: int) -> tuple[int, int]:
     lines = np.moveaxis(brightest, axis, 0)
     if not first or first + last >= len(lines) - 2 * _STRIP_PX:
         return 0, 0
+    seen = np.flatnonzero(lines.max(axis=0) > _BLACK)
+    lines = lines[:, seen[0] : seen[-1] + 1]  # but for a bar across these
     begins, ends = _begin(lines[first : first + _STRIP_PX]), _begin(lines[::-1][last : last + _STRIP_PX])
     return (0, 0) if begins is None or ends is None else (first + begins, last + ends)
 
 
 def _begin(lines: NDArray[np.uint8]) -> int | None:
-    """The first of some lines that shows something nearly all along, but for a bar across it."""
-    inside = np.flatnonzero(lines.max(axis=0) > _BLACK)
-    seen = (lines[:, inside[0] : inside[-1] + 1] > _SEEN).mean(axis=1) >= _STRAIGHT
+    """The first of some lines that shows something nearly all along."""
+    seen = (lines > _SEEN).mean(axis=1) >= _STRAIGHT
     return int(seen.argmax()) if seen.any() else None
 
 
