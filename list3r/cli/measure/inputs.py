@@ -93,7 +93,9 @@ def _given(path: Path) -> Trajectory:
     read = getattr(source, "read_poses", None)
     poses = [] if read is None else read()
     if not poses:
-        raise OptionError(f"{path} has no poses; give a TUM trajectory file, a memory, or a source with poses")
+        raise OptionError(
+            f"{path} has no poses; give a trajectory file (TUM, EuRoC, KITTI), a memory, or a source with poses"
+        )
     return Trajectory(np.array([time_s for _, time_s, _ in poses]), np.stack([T for _, _, T in poses]))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, Listing, Reader, SourceInfo, missing_parts
+from list3r.frames.beside import role_of
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
 from list3r.frames.layout import FolderLayout, Optics
@@ -270,6 +271,7 @@ class _Topics:
     def color(self) -> Stream:
         """The pictures. Raises `SourceError` where none or several would fit."""
         found = [s for s in self._streams.values() if not is_depth(s.first)]
+        found = [s for s in found if role_of(s.topic) != "depth"] or found
         return self._choose("color", found, ("color", "rgb"))
 
     def depth(self) -> Stream | None:
