@@ -172,6 +172,56 @@ def write_polycam(root: Path) -> Path:
     return root
 
 
+def write_scannerapp(root: Path) -> Path:
+    for k, shot in enumerate(shots()):
+        table = {"intrinsics": [K[0], 0, K[2], 0, K[1], K[3], 0, 0, 1], "time": 5 + k / 10, "frame_index": k}
+        table["cameraPoseARFrame"] = arkit(shot.T_world_cam).ravel().tolist()
+        put(root / f"frame_{k:05d}.json", json.dumps(table))
+        put(root / f"frame_{k:05d}.jpg", jpeg(shot.color))
+        put(root / f"depth_{k:05d}.png", png(millimetres(shot.depth)))
+        put(root / f"conf_{k:05d}.png", png(np.full(shot.depth.shape, 2, np.uint8)))
+    return root
+
+
+def write_record3d_exr(root: Path) -> Path:
+    """An export "EXR + JPG"."""
+    poses = []
+    for k, shot in enumerate(shots()):
+        T = arkit(shot.T_world_cam)
+        poses.append([*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]])
+        put(root / f"rgb/{k}.jpg", jpeg(shot.color))
+        put(root / f"depth/{k}.exr", exr(shot.depth))
+    meta = {"w": WIDTH, "h": HEIGHT, "dw": DEPTH_WIDTH, "dh": DEPTH_HEIGHT, "fps": 30, "poses": poses}
+    put(root / "metadata.json", json.dumps(meta | {"K": [K[0], 0, 0, 0, K[1], 0, K[2], K[3], 1]}))
+    return root
+
+
+def exr(depth: NDArray[np.float32], packing: int = 3) -> bytes:
+    """An OpenEXR file of the channel R, by scan lines: 0 as it is, 3 zip of 16 lines."""
+    height, width = depth.shape
+    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    channel = b"R\0" + struct.pack("<iIii", 2, 0, 1, 1) + b"\0"
+    head = b"v/1\x01" + struct.pack("<I", 2)
+    for name, kind, value in (
+        (b"channels", b"chlist", channel), (b"compression", b"compression", bytes([packing])),
+        (b"dataWindow", b"box2i", box), (b"displayWindow", b"box2i", box), (b"lineOrder", b"lineOrder", b"\0"),
+    ):  # fmt: skip
+        head += name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value
+    lines = 16 if packing == 3 else 1
+    blocks = []
+    for top in range(0, height, lines):
+        raw = np.frombuffer(depth[top : top + lines].astype("<f4").tobytes(), np.uint8)
+        if packing == 3:
+            mixed = np.concatenate([raw[::2], raw[1::2]]).astype(np.int64)
+            steps = np.append(mixed[0], np.diff(mixed) + 128)
+            packed = zlib.compress(steps.astype(np.uint8).tobytes())
+            raw = raw if len(packed) >= len(raw) else np.frombuffer(packed, np.uint8)
+        blocks.append(struct.pack("<iI", top, len(raw)) + raw.tobytes())
+    start = len(head) + 1 + 8 * len(blocks)
+    places = np.cumsum([start, *(len(b) for b in blocks[:-1])])
+    return head + b"\0" + places.astype("<u8").tobytes() + b"".join(blocks)
+
+
 def write_arkitscenes(root: Path) -> Path:
     rows = []
     for k, shot in enumerate(shots()):

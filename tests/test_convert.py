@@ -9,6 +9,7 @@ import pytest
 
 from list3r.frames.convert import LAYOUTS, convert
 from list3r.frames.decoding.decode import read_raw_depth
+from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
 from list3r.frames.writers.pictures import png16
 from list3r.memory.errors import ExportError, OptionError, SourceError
@@ -60,7 +61,7 @@ def test_nothing_is_left_where_nothing_could_be_written(tmp_path: Path) -> None:
         convert(source, "tum", tmp_path / "b")
     flat = write_nerfstudio(tmp_path / "d", frames=[{"file_path": "images/frame_00001.jpg"}])
     with pytest.raises(SourceError, match="no poses"):
-        convert(flat, "replica", tmp_path / "e")
+        convert(flat, "replica", tmp_path / "e", SourceOptions(kind="nerfstudio"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b", "d"]
 
 

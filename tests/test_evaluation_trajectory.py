@@ -101,7 +101,10 @@ def test_tum_files_come_back(tmp_path: Path) -> None:
         ("", "no poses"),
         ("# only a comment\n", "no poses"),
         ("0 1 2 3 0 0 0\n", "7 numbers"),
-        ("0 1 2 3 0 0 0 nan\n", "finite"),
+        ("0 1 2 3 0 0 0 nan\n", "none of its 1 rows is finite"),
+        ("0 1 2 3 0 0 0 1\n1 0.5 0.5 0.5 -0.5 1 2 3\n", "line 2: the quaternion has length"),
+        ("0 1 2 3 0 0 0 1\n0 1 2 3 0 0 1\n", "line 2 has 7 numbers"),
+        ("1 0 0 0 0 2 0 0 0 0 1 0\n", "line 1 is not a rigid motion"),
         ("0 1 2 3 0 0 0 0\n", "quaternion"),
         ("0 1 2 x 0 0 0 1\n", "line 1"),
     ],
@@ -110,6 +113,45 @@ def test_a_file_that_is_no_trajectory_is_named(tmp_path: Path, text: str, words:
     path = tmp_path / "bad.txt"
     path.write_text(text)
     with pytest.raises(SourceError, match=words):
+        read_tum(path)
+
+
+def test_rows_that_are_not_finite_are_skipped_and_said(tmp_path: Path) -> None:
+    trajectory = random_walk(5)
+    write_tum(tmp_path / "a.txt", trajectory)
+    lines = (tmp_path / "a.txt").read_text().splitlines()
+    lines[7] = lines[7].split()[0] + " nan nan nan nan nan nan nan"
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    back = read_tum(tmp_path / "a.txt")
+    assert len(back.time_s) == 79 and back.notes == ("1 of 80 rows of a.txt are not finite and are skipped",)
+
+
+def test_the_same_path_is_read_from_euroc_and_kitti(tmp_path: Path) -> None:
+    truth = random_walk(5)
+    write_tum(tmp_path / "a.txt", truth)
+    rows = [line.split() for line in (tmp_path / "a.txt").read_text().splitlines()[1:]]
+    head = "#timestamp [ns], p_RS_R_x [m], p_y, p_z, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+    stamps = [f"{round(float(r[0]) * 1e6)}000" for r in rows]
+    more = ",0,0,0,0,0,0,0,0,0"
+    euroc = [f"{t},{','.join(r[1:4])},{r[7]},{','.join(r[4:7])}" for t, r in zip(stamps, rows, strict=True)]
+    (tmp_path / "data.csv").write_text(head + "\n".join(row + more for row in euroc))
+    (tmp_path / "short.csv").write_text("\n".join(euroc))
+    (tmp_path / "kitti.txt").write_text("\n".join(" ".join(map(str, T[:3].ravel())) for T in truth.T_world_cam))
+    for name in ("data.csv", "short.csv", "kitti.txt"):
+        found = read_tum(tmp_path / name)
+        assert np.allclose(found.T_world_cam, truth.T_world_cam, atol=1e-6), name
+        errors = evaluate_trajectory(truth, found)
+        assert errors.pairs == 80 and errors.ate_se3_m.rmse < 1e-6, name
+    (tmp_path / "kitti.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9)
+    with pytest.raises(OptionError, match="9 rows without times, the other 80 with times"):
+        evaluate_trajectory(truth, read_tum(tmp_path / "kitti.txt"))
+
+
+def test_columns_in_another_order_are_refused(shared_data: Path) -> None:
+    path = shared_data / "cases/eval_quaternion_not_unit/est.txt"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    with pytest.raises(SourceError, match="line 1: the quaternion has length"):
         read_tum(path)
 
 

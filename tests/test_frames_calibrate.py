@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from list3r.frames.base import Camera
+from list3r.frames.base import Camera, Frame, Reader, SourceInfo
 from list3r.frames.inspection import SourceReport
 from list3r.frames.registration.calibrate import DepthCalibrationSettings, calibrate
+from list3r.frames.registration.edge_look import depth_doubts
 from list3r.frames.registration.edges import depth_edges
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.errors import SourceError
 from tests.frames_scenes import cards, moved, paint, write_png
+from tests.rgbd_scenes import CAMERA, frames_along, walk
 
 DEPTH = Camera(320, 240, 290.0, 290.0, 160.0, 120.0)
 COLOR = Camera(320, 240, 262.0, 262.0, 160.0, 120.0)
@@ -96,3 +102,34 @@ def test_depth_edges_are_the_near_side_even_across_a_shadow() -> None:
     border = {(x, y) for x in range(20, 40) for y in range(10, 30) if x in (20, 39) or y in (10, 29)}
     assert outline == border
     assert set(edges.x[edges.horizontal].tolist()) == {20, 39}
+
+
+class Apart(Reader):
+    """A walk whose depth is that of other frames, or turned."""
+
+    def __init__(self, lag: int, turn: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
+        self._frames, self._lag, self._turn = sound_walk(), lag, turn
+        self._info = SourceInfo("video", "walk", len(self._frames), 30.0, CAMERA, True, False, "metric", "")
+
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame]:
+        for k in range(len(self._frames))[start:stop:step]:
+            other = self._frames[min(max(k - self._lag, 0), len(self._frames) - 1)]
+            assert other.depth is not None
+            yield replace(self._frames[k], depth=np.ascontiguousarray(self._turn(other.depth)))
+
+    def position(self, index: int) -> int:
+        return index
+
+
+@cache
+def sound_walk() -> list[Frame]:
+    return frames_along(walk(60, speed=3.0))
+
+
+def test_depth_that_is_late_or_mirrored_is_noticed_and_sound_depth_is_not() -> None:
+    assert depth_doubts(Apart(0, lambda z: z)) == ()
+    (late,) = depth_doubts(Apart(15, lambda z: z))
+    assert "would fit pictures about 0.5 s earlier" in late
+    (mirrored,) = depth_doubts(Apart(0, lambda z: z[:, ::-1]))
+    assert "would fit if it were mirrored" in mirrored
+    assert depth_doubts(Apart(0, lambda z: np.full_like(z, 2.0))) == ()  # a wall shows no steps

@@ -65,7 +65,9 @@ def write_phone_spool(root: Path) -> Path:
 FORMATS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "record3d": (recordings.write_record3d, "lzfse"),
     "stray": (recordings.write_stray, ""),
+    "record3d exr": (recordings.write_record3d_exr, ""),
     "polycam": (recordings.write_polycam, ""),
+    "scannerapp": (recordings.write_scannerapp, ""),
     "arkitscenes": (recordings.write_arkitscenes, ""),
     "scannet": (recordings.write_scannet, ""),
     "scannet .sens": (recordings.write_sens, ""),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -195,6 +196,7 @@ def test_pictures_of_a_fisheye_become_those_of_a_pinhole(tmp_path: Path) -> None
         frame["file_path"] = frame["file_path"].replace(".jpg", ".png")
         del frame["depth_file_path"]
     put(path / "transforms.json", json.dumps(said))
+    shutil.rmtree(path / "depth")
     seen = frames_of(path)[0].color.astype(float)
     x, y = (np.array([100, 60, 40]) - 79.5) / 140, (np.array([60, 90, 30]) - 59.5) / 140
     angle = np.arctan(np.hypot(x, y))

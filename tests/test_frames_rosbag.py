@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -149,3 +151,82 @@ def test_a_file_of_noise_is_one_clear_line(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"\x89" * 500)
         with pytest.raises(List3rError, match="ROS recording"):
             open_source(tmp_path / name)
+
+
+def rvl(depth: np.ndarray) -> bytes:
+    """Depth packed as Wilson 2017 describes it, a number at a time."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            nibbles.append((value & 7) | (8 if value > 7 else 0))
+            value >>= 3
+            if not value:
+                return
+
+    flat, at, last = depth.ravel().tolist(), 0, 0
+    while at < len(flat):
+        for known in (False, True):
+            run = next((k for k in range(at, len(flat)) if bool(flat[k]) != known), len(flat)) - at
+            put(run)
+            for value in flat[at : at + run] if known else ():
+                step = value - last
+                put(2 * step if step >= 0 else -2 * step - 1)
+                last = value
+            at += run
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{n:x}" for n in nibbles[k : k + 8]), 16) for k in range(0, len(nibbles), 8)]
+    height, width = depth.shape
+    return struct.pack("<ii", width, height) + np.array(words, "<u4").tobytes()
+
+
+FORMS = {
+    "png": ("16UC1; png compressed ", "/camera/depth/image_raw/compressed", lambda z: recordings.png(z)),
+    "png of an old driver": ("png", "/camera/depth/image_raw/compressed", lambda z: recordings.png(z)),
+    "rvl": ("16UC1; compressedDepth rvl", "/camera/depth/image_raw/compressedDepth", lambda z: bytes(12) + rvl(z)),
+}
+
+
+def write_packed(root: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A bag whose depth is packed in another form, with a hole in it."""
+    said, topic, pack = FORMS[form]
+    messages = recordings._messages
+
+    def changed(put_, **how):
+        for name, kind, time, message in messages(put_, **how):
+            if "Depth" in name:
+                z = cv2.imdecode(np.frombuffer(message.data.tobytes()[12:], np.uint8), cv2.IMREAD_UNCHANGED)
+                z[:5, :7] = 0
+                data = np.frombuffer(pack(z), np.uint8)
+                message = put_.make(kind, header=message.header, format=said, data=data)
+                name = topic
+            yield name, kind, time, message
+
+    monkeypatch.setattr(recordings, "_messages", changed)
+    return write_bag(root, "bag", registered=True)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_depth_topics_are_read_however_they_are_packed(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_packed(tmp_path / "walk", form, monkeypatch)
+    asked = SourceOptions(topics=(("depth", FORMS[form][1]),))
+    for options in (SourceOptions(), asked):
+        source = open_source(path, options)
+        frames = [f for f in source.read(0, COUNT) if isinstance(f, Frame)]
+        assert len(frames) == COUNT
+        for frame in frames:
+            assert frame.depth is not None and not frame.depth[:5, :7].any()
+            assert np.median(off_plane(world_points(frame, source.info.camera))) < 0.002
+
+
+def test_a_topic_that_is_no_depth_or_pose_is_refused_where_it_is_asked_for(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "walk", "mcap")
+    for role, topic, words in (
+        ("depth", "/camera/color/image_raw", "rgb8 are no depth"),
+        ("depth", "/camera/color/camera_info", "not a topic of pictures"),
+        ("pose", "/camera/color/image_raw", "poses are of Odometry"),
+    ):
+        with pytest.raises(OptionError, match=words):
+            open_source(path, SourceOptions(topics=((role, topic),)))

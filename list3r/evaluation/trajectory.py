@@ -7,15 +7,15 @@ SLAM systems", 2012): poses are associated by time, the alignment is Umeyama's o
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.files import MAX_TEXT_BYTES, read_file
+from list3r.frames.recordings.pose_lists import read_pose_list
 from list3r.memory.errors import DegenerateError, OptionError, SourceError
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation, rotation_from_quat_wxyz, rotation_log, umeyama
+from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation, rotation_log, umeyama
 from list3r.memory.records import JsonFields
 
 Array = NDArray[np.float64]
@@ -29,6 +29,10 @@ class Trajectory:
     """Seconds, ascending. Shape (F,)."""
     T_world_cam: Array
     """Shape (F, 4, 4)."""
+    counted: bool = False
+    """The file states no times: these are the numbers of its rows."""
+    notes: tuple[str, ...] = ()
+    """What was left out when it was read."""
 
     def __post_init__(self) -> None:
         if self.T_world_cam.shape != (len(self.time_s), 4, 4):
@@ -129,41 +133,43 @@ class TrajectoryErrors(JsonFields):
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """Read `time_s tx ty tz qx qy qz qw` lines; `#` starts a comment; spaces, tabs or commas between numbers.
+    """Read `time_s tx ty tz qx qy qz qw` lines (TUM), EuRoC's tables with nanoseconds, or KITTI's 12 numbers.
 
-    Raises `SourceError` for a file that is absent or has a line that is no pose. Rows are sorted by time.
+    Raises `SourceError` for a file that is absent or has a line that is no pose. Rows are sorted by time; those that
+    are not finite are left out, with a note.
     """
     path = Path(path)
-    rows: list[list[float]] = []
     try:
-        lines = read_file(path, MAX_TEXT_BYTES).decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror or str(error) if isinstance(error, OSError) else "it is not a text file"
-        raise SourceError(f"cannot read the trajectory {path}: {reason}") from error
-    for number, line in enumerate(lines, 1):
-        words = line.split("#", 1)[0].replace(",", " ").split()
-        if words:
-            rows.append(_tum_row(words, f"{path} line {number}"))
-    if not rows:
-        raise SourceError(f"{path} holds no poses; expected lines of: time_s tx ty tz qx qy qz qw")
-    table = np.array(rows)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = rotation_from_quat_wxyz(table[:, [7, 4, 5, 6]])
-    poses[:, :3, 3] = table[:, 1:4]
-    return Trajectory(table[:, 0], poses)
+        found = read_pose_list(path, timed=True)
+    except SourceError as error:
+        if path.is_file():
+            raise
+        raise SourceError(f"cannot read the trajectory {path}: {error}") from error
+    time_s = np.arange(len(found.T), dtype=np.float64) if found.time_s is None else found.time_s
+    rows = np.flatnonzero(found.known & np.isfinite(time_s))
+    rows, left = rows[np.argsort(time_s[rows], kind="stable")], len(time_s) - len(rows)
+    if not len(rows):
+        raise SourceError(f"{path} holds no poses: none of its {left} rows is finite")
+    notes = (f"{left} of {len(time_s)} rows of {path.name} are not finite and are skipped",) if left else ()
+    return Trajectory(time_s[rows], found.T[rows], found.time_s is None, notes)
 
 
-def _tum_row(words: list[str], where: str) -> list[float]:
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError as error:
-        raise SourceError(f"{where} is not a pose ({error}); expected: time_s tx ty tz qx qy qz qw") from error
-    if len(numbers) != 8 or not np.isfinite(numbers).all():
-        raise SourceError(f"{where} has {len(numbers)} numbers; expected 8 finite ones: time_s tx ty tz qx qy qz qw")
-    if not np.linalg.norm(numbers[4:]) > 1e-6:
-        raise SourceError(f"{where} has a quaternion of length zero; expected qx qy qz qw of a rotation")
-    return numbers
+def on_one_clock(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """Return both with times, where one has rows without any: row n of it belongs to row n of the other.
+
+    Raises `OptionError` where their numbers of rows differ.
+    """
+    if truth.counted == estimate.counted:
+        return truth, estimate
+    timed, other = (estimate, truth) if truth.counted else (truth, estimate)
+    matched = len(other.time_s) == len(timed.time_s) or other.notes
+    if timed.notes or not matched or other.time_s[-1] >= len(timed.time_s):
+        raise OptionError(
+            f"one trajectory has {len(other.time_s)} rows without times, the other {len(timed.time_s)} with times; "
+            "give both with times (TUM), or as many rows"
+        )
+    placed = replace(other, time_s=timed.time_s[other.time_s.astype(np.int64)], counted=False)
+    return (placed, estimate) if truth.counted else (truth, placed)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
@@ -206,6 +212,7 @@ def evaluate_trajectory(
     alignment.
     """
     apart = delta or Delta(delta_frames)
+    truth, estimate = on_one_clock(truth, estimate)
     a, b = associated(truth, estimate, tolerance_s)
     rigid = align(a, b, with_scale=False)
     similar = align(a, b, with_scale=True)
@@ -228,6 +235,7 @@ def evaluate_trajectory(
 
 def associated(truth: Trajectory, estimate: Trajectory, tolerance_s: float = 0.01) -> tuple[Trajectory, Trajectory]:
     """Return truth and estimate at the moments that both have. Raises `OptionError` when these are fewer than three."""
+    truth, estimate = on_one_clock(truth, estimate)
     rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
     if len(rows) < 3:
         raise OptionError(

@@ -107,8 +107,11 @@ class SourceInfo:
     image_size: tuple[int, int] | None = None
     """Height and width of the frames handed out, px."""
     stored_size: tuple[int, int] | None = None
-    """Height and width of the pictures as stored, upright, where frames are made smaller; None where they may not be.
+    """Height and width of the pictures as stored, upright, without bars, where frames are made smaller; None where they
+    may not be.
     """
+    corner: tuple[int, int] = (0, 0)
+    """Row and column of the stored pictures, upright, where what is handed out begins: black bars are cut off."""
     poses_metric: bool = True
     """Whether given poses are in metres; a model of COLMAP has a unit of its own."""
     z_up: bool = False

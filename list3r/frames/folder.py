@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import (
     clean_depth,
     fault_of,
@@ -28,7 +29,9 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal
+from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
 from list3r.frames.deferred import LazyFrame
+from list3r.frames.files import picture_size
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
@@ -36,7 +39,7 @@ from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
-from list3r.frames.unread import not_read
+from list3r.frames.unread import not_read, not_read_note
 from list3r.memory.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
@@ -46,6 +49,8 @@ _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
 _POSES_TRIED = 50
 _FILES_TRIED = 12
+_SIZES_LOOKED_AT = 500
+"""Pictures whose size is looked at, by their heads."""
 _MOST_OFF_CENTRE = 0.2
 """Of a camera's centre from the middle of its picture, as a share of the side."""
 NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `confidence` belong to this recording?"
@@ -78,7 +83,7 @@ class FolderSource(Reader):
         if fractions and self._typical_raw <= _MOST_M:  # larger numbers with fractions are in the layout's unit
             self.optics = optics = replace(optics, depth_scale=1.0)
             notes = (*notes, "depth is stored with fractions: metres are assumed; --depth-scale changes that")
-        self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side)
+        self._rig = build_rig(optics, *sizes, options.max_depth_m, options.max_side, self._shown_part(root))
         self._T_posed_color: NDArray[np.float64] = np.eye(4)
         if layout.poses_of == "depth" and optics.T_color_depth is not None:
             self._T_posed_color = np.asarray(np.linalg.inv(optics.T_color_depth), dtype=np.float64)
@@ -227,11 +232,40 @@ class FolderSource(Reader):
                     return color.shape[:2], None
                 if file.depth is not None:
                     raw = read_raw_depth(file.depth)
+                    if raw.dtype == np.uint8:
+                        raise SourceError(
+                            f"{root}: depth images like {file.depth.name} have 8 bits, 255 steps, as pictures of depth "
+                            "for people have; export depth with 16 bits, or use --kind images on the pictures' folder "
+                            "to take colour alone"
+                        )
                     self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
                     return color.shape[:2], raw.shape
             except FrameError as error:
                 reason = reason or str(error)
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
+
+    def _shown_part(self, root: Path) -> Shown | None:
+        """Return the part of pictures without depth that is no black bar. Raises `SourceError` for panoramas."""
+        files, chosen = self._layout.files, self._chosen
+        if (
+            self._has_depth
+            or self._layout.kind == "live"
+            or any(files[k].lens is not None for k in (0, len(files) - 1))
+        ):
+            return None
+        numbers = np.unique(np.linspace(0, len(chosen) - 1, LOOKED_AT).astype(int))
+        pictures = self._decodable(files[int(chosen.starts[k])] for k in numbers.tolist())
+        first = next(pictures, None)
+        if first is None:
+            return None
+        if self.optics.intrinsics is None:
+            check_no_panorama([first], str(root))
+        return shown_part(chain([first], pictures))
+
+    def _decodable(self, files: Iterable[FrameFile]) -> Iterator[NDArray[np.uint8]]:
+        for file in files:
+            with contextlib.suppress(FrameError):
+                yield self._color(file)
 
     def _doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with depth, poses and times."""
@@ -260,10 +294,18 @@ class FolderSource(Reader):
             )
         tried = np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round()).astype(int).tolist()
         some = [files[k] for k in tried if k not in empty]
+        sizes = Counter(size for k in _spread(len(files), _SIZES_LOOKED_AT) if (size := picture_size(files[k].color)))
+        if len(sizes) > 1:
+            (usual, most), total = sizes.most_common(1)[0], sum(sizes.values())
+            others = ", ".join(f"{w}x{h}" for w, h in [s for s, _ in sizes.most_common(4)][1:])
+            out.append(
+                f"{total - most} of {total} pictures looked at are of another size ({others}) than most "
+                f"({usual[0]}x{usual[1]}) and cannot be used"
+            )
         faults = [found for f in some if (found := fault_of(f.color) or (fault_of(f.depth) if f.depth else None))]
         if faults:
             out.append(f"{len(faults)} of {len(some)} frames looked at cannot be used ({faults[0]})")
-        return tuple(f"{found}; is the copy complete?" for found in out)
+        return tuple(found if "size" in found else f"{found}; is the copy complete?" for found in out)
 
     def _scale_doubts(self) -> tuple[str, ...]:
         """A `--depth-scale` that is not that of the layout: depth, and all that is made of it, has another size."""
@@ -347,7 +389,9 @@ class FolderSource(Reader):
         notes = (*notes, *self._doubts())
         guess, turns = self._camera_guess(), self._turns()
         missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
-        if rig.color_size != rig.stored_size:
+        if rig.shown is not None:
+            notes = (*notes, shown_note(rig.shown, rig.stored_size))
+        if rig.color_size != rig.shown_size:
             notes = (*notes, reduced_note(rig))
         if self._bits < 16:
             notes = (
@@ -355,6 +399,9 @@ class FolderSource(Reader):
                 f"the pictures use {self._bits} of their 16 bits; these are taken as the full range of brightness",
             )
         has_poses = len(layout.files.that_hold(POSE_FILE | POSE)) > 0
+        left = not_read(root, layout.kind, self._some_files(), layout.read)
+        if self._options.kind == "auto":
+            refuse_left(root, layout.kind, left, depth=self._has_depth, poses=has_poses, camera=rig.camera is not None)
         separate = rig.registration
         if layout.z_up and turns is None and len(layout.files.that_hold(POSE_FILE | POSE)):
             notes = (*notes, NOT_STANDING)
@@ -372,10 +419,11 @@ class FolderSource(Reader):
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
-            notes=(*layout.notes, *notes, *not_read(root, layout.kind, self._some_files())),
+            notes=(*layout.notes, *notes, *not_read_note(left)),
             missing=tuple(missing),
             image_size=rig.color_size,
-            stored_size=rig.stored_size,
+            stored_size=rig.shown_size,
+            corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),
             camera_guess=guess,
             poses_metric=layout.poses_metric,
             z_up=turns is not None,
@@ -408,6 +456,10 @@ class FolderSource(Reader):
         return None if focal is None else centred_camera(focal, self._rig)
 
 
+def _spread(count: int, most: int) -> list[int]:
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist() if count else []
+
+
 def without_pose(count: int, total: int) -> str:
     """That some frames have no pose, for people."""
     return f"{count} of {total} frames have no pose"
@@ -422,14 +474,14 @@ def without_depth(deep: Sequence[int] | NDArray[np.int64], total: int) -> str:
 
 def centred_camera(focal: float, rig: Rig) -> Camera:
     """Return a camera with its centre in the middle, for a focal length in px of the pictures as stored."""
-    height, width = rig.stored_size
+    height, width = rig.shown_size
     stored = Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0)
     return stored.resized(*rig.color_size)
 
 
 def reduced_note(rig: Rig) -> str:
     """That frames are smaller than stored, for people."""
-    (h, w), (height, width) = rig.stored_size, rig.color_size
+    (h, w), (height, width) = rig.shown_size, rig.color_size
     return f"pictures of {w}x{h} are reduced to {width}x{height}; --max-side changes that (0: never)"
 
 

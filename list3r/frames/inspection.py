@@ -23,6 +23,8 @@ class SourceReport:
     """The picture of depth edges over colour that was written."""
     unusable: tuple[str, ...] = ()
     """Frames that cannot be used, as far as a quick look tells: a build leaves them out."""
+    doubts: tuple[str, ...] = ()
+    """What looks wrong with depth and pictures, though a build takes them."""
     wrong: tuple[str, ...] = ()
     """How poses, depth and camera contradict each other: a build that uses the poses is refused."""
 
@@ -49,6 +51,7 @@ class SourceReport:
             "notes": list(info.notes),
             "missing": list(info.missing),
             "unusable": list(self.unusable),
+            "doubts": list(self.doubts),
             "wrong": list(self.wrong),
         }
         if self.calibration is not None:
@@ -71,6 +74,7 @@ class SourceReport:
             *(f"note         {note}" for note in info.notes),
             *(f"missing      {what}" for what in info.missing),
             *(f"unusable     {what}; build leaves such frames out" for what in self.unusable),
+            *(f"warning      {what}" for what in self.doubts),
             *(f"wrong        {what}; build refuses such poses (--poses estimate needs none)" for what in self.wrong),
             *([] if self.calibration is None else _calibration_lines(self.calibration)),
             *([] if self.overlay is None else [f"overlay      {self.overlay}"]),

@@ -75,6 +75,8 @@ class FolderLayout:
     """Whether the recorder's gravity makes z of the given poses' world point up."""
     poses_drift: bool = False
     """Whether given poses were followed as the recording went on and never put right: they drift, and may jump."""
+    read: tuple[str, ...] = ()
+    """Names in the folder, beside the files of frames, that were read."""
     upright_tags: bool = True
     """Whether pictures are turned as their EXIF says; not where intrinsics and poses are those of the stored pixels."""
 
@@ -205,8 +207,11 @@ def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
 
 
 def inside(root: Path, name: str, stated_in: Path) -> Path:
-    """Return the path of a name within a folder. Raises `SourceError` for one that leads out of it."""
-    path = root / name
+    """Return the path of a name, also as Windows writes it, within a folder.
+
+    Raises `SourceError` for one that leads out of it.
+    """
+    path = root / name.replace("\\", "/")
     led = path.name == ".." or path.is_symlink()
     if not (path.resolve().is_relative_to(root.resolve()) if led else _lies_in(path.parent, root)):
         raise SourceError(f"{stated_in} names {name}, which lies outside of {root}; copy it there or correct the name")

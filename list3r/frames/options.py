@@ -23,6 +23,7 @@ KINDS = (
     "record3d",
     "stray",
     "polycam",
+    "scannerapp",
     "arkitscenes",
     "scannet",
     "scannetpp",
@@ -104,7 +105,8 @@ class SourceOptions:
         }
         given = [option for option, is_given in options.items() if is_given]
         if given and not info.has_depth:
-            raise OptionError(f"{info.path} has no depth; leave out {' and '.join(given)}")
+            why = next((f" that is read ({n})" for n in info.notes if "not read" in n and "depth" in n), "")
+            raise OptionError(f"{info.path} has no depth{why}; leave out {' and '.join(given)}")
 
     def topics_by_role(self) -> dict[str, str]:
         """Return the topics that were chosen, by role."""

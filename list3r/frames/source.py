@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from list3r.frames.base import Camera, FrameSource, Listing, SourceInfo
+from list3r.frames.beside import listed, role_of
 from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.live.addresses import is_stream, without_secrets
@@ -25,7 +26,7 @@ from list3r.frames.readers import (
     spool,
     tum,
 )
-from list3r.frames.readers.phones import arkitscenes, polycam, record3d, scannetpp, stray
+from list3r.frames.readers.phones import arkitscenes, polycam, record3d, scannerapp, scannetpp, stray
 from list3r.memory.errors import OptionError, SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
@@ -33,6 +34,7 @@ __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "requir
 FOLDERS: dict[str, Callable[[Path, SourceOptions], FolderLayout | None]] = {
     "record3d": record3d.find,
     "polycam": polycam.find,
+    "scannerapp": scannerapp.find,
     "arkitscenes": arkitscenes.find,
     "scannet": scannet.find,
     "euroc": euroc.find,
@@ -53,23 +55,10 @@ FILES: dict[str, tuple[str, Callable[[Path, SourceOptions], FolderLayout]]] = {
 
 _VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 _OTHER_PICTURES = (".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf")
-_NO_PICTURES = (
-    "confidence",
-    "depth",
-    "depths",
-    "mask",
-    "masks",
-    "ids",
-    "lowres_depth",
-    "semantic",
-    "normal",
-    "normals",
-)
-"""Folders whose pictures are none of a room."""
 _SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _WANTED = (
-    "give a video file, a recording of Record3D (.r3d), Stray Scanner, Polycam or ScanNet (.sens), a ROS bag or mcap, "
-    "a recording of Aria (.vrs), a data set of LeRobot, "
+    "give a video file, a recording of Record3D (.r3d), Stray Scanner, 3D Scanner App, Polycam or ScanNet (.sens), a "
+    "ROS bag or mcap, a recording of Aria (.vrs), a data set of LeRobot, "
     "a folder in ARKitScenes, nerfstudio (transforms.json), COLMAP, 7-Scenes, TUM RGB-D or Replica layout, or of images"
 )
 
@@ -165,10 +154,12 @@ def _open_folder(root: Path, options: SourceOptions) -> FrameSource:
         raise SourceError(
             f"{root} holds pictures like {pictures}, which cannot be read here; convert them to JPEG or PNG"
         )
-    folders = (p for p in sorted(root.iterdir()) if p.is_dir() and p.name.lower() not in _NO_PICTURES)
-    inside = next((p for p in folders if images.find(p, options)), None)
-    if inside is not None and options.kind in ("auto", "images"):
-        raise SourceError(f"{root} holds no images itself, but its folder {inside.name} does; give {inside}")
+    folders = [p for p in sorted(root.iterdir()) if p.is_dir() and role_of(p.name) in ("color", None)]
+    inside = [p for p in folders if listed(p, IMAGE_ENDINGS)]
+    if inside and options.kind in ("auto", "images"):
+        names = ", ".join(p.name for p in inside[:4]) + (" and more" if len(inside) > 4 else "")
+        what = f"its folder {names} does" if len(inside) == 1 else f"its folders {names} do"
+        raise SourceError(f"{root} holds no images itself, but {what}; give {inside[0]}")
     problem = "in no known layout" if options.kind == "auto" else f"not in the {options.kind} layout"
     raise SourceError(f"{root} is {problem}; {_WANTED}")
 

@@ -16,6 +16,7 @@ from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.chunking.pace import PaceSettings, depth_step
 from list3r.frames.pose_agreement import disagreements
+from list3r.frames.registration.edge_look import depth_doubts
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.registry import check_choice
 from list3r.memory.errors import OptionError, SourceError, TrackingError
@@ -156,6 +157,7 @@ def prepare(
             check_beside(chosen, first)
     chosen = resolve_settings(chosen, info)
     check_buildable(info, chosen)
+    notes += depth_doubts(opened)
     if chosen.poses != "estimate":
         check_agreement(opened)
     return Job(source, options, with_weights(chosen, run.licence), info, run, tuple(notes), opened)

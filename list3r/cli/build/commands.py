@@ -40,6 +40,7 @@ def inspect(
     from list3r.frames.inspection import SourceReport, draw_registration
     from list3r.frames.pose_agreement import disagreements
     from list3r.frames.quick_look import unusable
+    from list3r.frames.registration.edge_look import depth_doubts
     from list3r.frames.source import open_source
 
     options = given.options(more)
@@ -55,7 +56,7 @@ def inspect(
     if overlay is not None:
         with replacing(overlay) as temporary:
             draw_registration(opened, temporary)
-    report = SourceReport(opened.info, found, overlay, unusable(opened), disagreements(opened))
+    report = SourceReport(opened.info, found, overlay, unusable(opened), depth_doubts(opened), disagreements(opened))
     if json:
         print_answer([report.as_dict()])
     else:

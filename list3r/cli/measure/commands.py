@@ -60,7 +60,7 @@ class TrajectoryArguments:
 
 
 def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryArguments, json: JsonOption = False) -> None:
-    """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a TUM file, a memory, or a source with poses.
+    """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a file (TUM, EuRoC, KITTI), a memory, or a source with poses.
 
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
     """

@@ -42,12 +42,17 @@ def scale_of(path: Path) -> str:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """The poses of a TUM file, a memory, or a source. Says on standard error what a memory leaves out."""
+    """The poses of a file, a memory, or a source. Says on standard error what is left out."""
     from list3r.evaluation.trajectory import read_tum
 
     if is_source(path):
         return _given(path)
-    return _stored(path) if is_database(path) else read_tum(path)
+    if is_database(path):
+        return _stored(path)
+    found = read_tum(path)
+    for text in found.notes:
+        note(f"note: {text}")
+    return found
 
 
 def _stored(path: Path) -> Trajectory:
@@ -88,7 +93,9 @@ def _given(path: Path) -> Trajectory:
     read = getattr(source, "read_poses", None)
     poses = [] if read is None else read()
     if not poses:
-        raise OptionError(f"{path} has no poses; give a TUM trajectory file, a memory, or a source with poses")
+        raise OptionError(
+            f"{path} has no poses; give a trajectory file (TUM, EuRoC, KITTI), a memory, or a source with poses"
+        )
     return Trajectory(np.array([time_s for _, time_s, _ in poses]), np.stack([T for _, _, T in poses]))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_PIXELS, read_file, too_many_pixels
+from list3r.frames.recordings.exr import read_exr
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.memory.errors import FrameError
 
@@ -65,12 +66,19 @@ def read_raw_depth(path: Stored | CodedArray) -> NDArray[Any]:
         return path.decode()
     if path.suffix.lower() == ".npy":
         raw = _load_npy(path)
+    elif path.suffix.lower() == ".exr":
+        raw = read_exr(_read(path), path.name)
     else:
         raw = _decode(path, cv2.IMREAD_UNCHANGED)
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[..., 0]
     if raw.ndim != 2:
-        raise FrameError(f"{path.name} has the shape {raw.shape}; depth has (height, width)")
+        raise FrameError(
+            f"{path.name} has {raw.shape[2]} channels, a picture of depth for people; export depth as 16 bits of one "
+            "channel"
+            if raw.ndim == 3
+            else f"{path.name} has the shape {raw.shape}; depth has (height, width)"
+        )
     return raw
 
 
@@ -99,6 +107,17 @@ def clean_depth(raw: NDArray[Any], scale: float, max_depth_m: float | None) -> N
 
 def _decode(path: Stored, flags: int) -> NDArray[Any]:
     """Decode a file with OpenCV, and refuse one whose end is missing, which OpenCV would fill with grey."""
+    data = _read(path)
+    if fault := _fault(data):
+        raise FrameError(f"{path.name} is {fault}")
+    image = decode_picture(data, flags, path.name)
+    if image is None:
+        raise FrameError(f"{path.name} cannot be decoded")
+    return image
+
+
+def _read(path: Stored) -> bytes:
+    """What a file holds. Raises `FrameError` for one that is missing, empty or cannot be read."""
     try:
         data = _bytes(path)
     except FileNotFoundError:
@@ -107,12 +126,7 @@ def _decode(path: Stored, flags: int) -> NDArray[Any]:
         raise FrameError(f"{path.name} cannot be read ({error.strerror})") from None
     if not data:
         raise FrameError(f"{path.name} is empty")
-    if fault := _fault(data):
-        raise FrameError(f"{path.name} is {fault}")
-    image = decode_picture(data, flags, path.name)
-    if image is None:
-        raise FrameError(f"{path.name} cannot be decoded")
-    return image
+    return data
 
 
 def fault_of(path: Stored | CodedArray) -> str | None:

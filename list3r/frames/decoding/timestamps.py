@@ -14,6 +14,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.beside import role_of
 from list3r.frames.decoding.mp4_boxes import check_index
 from list3r.frames.files import MAX_PIXELS
 from list3r.frames.folder import DEFAULT_FPS
@@ -119,6 +120,10 @@ def _listed(path: Path, words: dict[str, str]) -> tuple[VideoTimestamps, float]:
         stream = picture_stream(container)
         if stream is None or any(sign in container.format.name for sign in _NOT_VIDEO):
             raise SourceError(_no_video(path, container))
+        if _said_deep(stream) or (_is_deep(stream) and role_of(path.stem) == "depth"):
+            raise SourceError(
+                f"{path} holds depth and no colour; give the recording that holds both, or a colour video"
+            )
         numbers, hidden, trimmed = array("q"), array("q"), 0
         for packet in packets(container, stream):  # none is kept: together they are the file
             if packet.size and not packet.is_discard:
@@ -149,17 +154,27 @@ def open_container(path: Path, words: dict[str, str]) -> Any:
 
 
 def picture_stream(container: Any) -> Any | None:
-    """Return the video stream to read, the largest; None where there is none; the cover of a piece of music is none."""
+    """Return the video stream to read, the largest of colour; None where there is none; a cover of music is none."""
     return next(iter(_picture_streams(container)), None)
 
 
 def _picture_streams(container: Any) -> list[Any]:
-    """Video streams, the largest pictures first, and of those of one size the one that a player would show."""
+    """Video streams, those of colour first, then the largest, and of those of one size what a player would show."""
     cover = int(getattr(av.stream.Disposition, "attached_pic", 0))
     shown = [s for s in container.streams.video if not int(s.disposition or 0) & cover]
     streams = [s for s in shown if s.codec_context is not None]  # none where FFmpeg lacks the decoder
     best = container.streams.best("video")
-    return sorted(streams, key=lambda s: (-(s.width or 0) * (s.height or 0), s is not best, s.index))
+    return sorted(streams, key=lambda s: (_is_deep(s), -(s.width or 0) * (s.height or 0), s is not best, s.index))
+
+
+def _is_deep(stream: Any) -> bool:
+    """Whether a stream holds depth or infrared: by its title, or one number of over 8 bits a pixel."""
+    parts: Any = getattr(stream.codec_context.format, "components", ())
+    return _said_deep(stream) or (len(parts) == 1 and int(parts[0].bits) > 8)
+
+
+def _said_deep(stream: Any) -> bool:
+    return role_of(str(stream.metadata.get("title", ""))) in ("depth", "mask")
 
 
 def packets(container: Any, stream: Any) -> Iterator[Any]:
@@ -223,9 +238,16 @@ def _other_streams(container: Any) -> tuple[str, ...]:
     streams = _picture_streams(container)
     if len(streams) < 2:
         return ()
-    return (
-        f"the file holds {len(streams)} video streams; the largest, {streams[0].width}x{streams[0].height}, is taken",
-    )
+    taken, *left = streams
+    which = f"that of colour, {_size(taken)}," if _is_deep(left[-1]) else f"the largest, {_size(taken)},"
+    out = f"the file holds {len(streams)} video streams; {which} is taken"
+    deep = ", ".join(f"{s.metadata.get('title', 'one')} ({_size(s)})" for s in left if _is_deep(s))
+    how = "convert the recording to images (Open3D's azure_kinect_mkv_reader) and give their folder"
+    return (out, *((f"depth and infrared are not read: {deep}; {how}",) if deep else ()))
+
+
+def _size(stream: Any) -> str:
+    return f"{stream.width}x{stream.height}"
 
 
 def _breaks_off(rows: _Rows, trimmed: int, container: Any, stream: Any) -> tuple[str, ...]:

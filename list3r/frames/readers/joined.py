@@ -24,7 +24,8 @@ class JoinedVideos(Reader):
         """Raises `SourceError` for a file that is no video or of another size, `OptionError` for a range."""
         if any(v is not None for v in (options.start, options.stop, options.start_s, options.end_s)):
             raise OptionError("--frames, --start and --end work on one file; cut the files, or give one")
-        self._parts = [VideoSource(path, replace(options, more=None)) for path in paths]
+        self._parts = [VideoSource(paths[0], replace(options, more=None))]
+        self._parts += [VideoSource(p, replace(options, more=None), like=self._parts[0]) for p in paths[1:]]
         first = self._parts[0].info
         for path, part in zip(paths, self._parts, strict=True):
             if part.stored_size != self._parts[0].stored_size:

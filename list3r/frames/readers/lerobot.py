@@ -184,7 +184,7 @@ def _video(
         episode=None, depth_scale=None, depth_intrinsics=None, T_color_depth=None, registered=False,
         max_side=_side(options, with_depth),
     )  # fmt: skip
-    video = VideoSource(path, words)
+    video = VideoSource(path, words, whole=True)
     missing = first + episode.length - video.stored_count
     late = abs(video.time_s(min(first, video.stored_count - 1)) - video.time_s(0) - begins_s) * fps
     if missing > 0 or late > _LATE:
@@ -199,7 +199,7 @@ class _DepthVideo:
     def __init__(self, path: Path, first: int, length: int, code: DepthCode | None) -> None:
         """`first` is the number of the episode's first frame in the file. Raises `SourceError`."""
         self.path, self._first, self._stop, self._code = path, first, first + length, code
-        self._video = VideoSource(path, SourceOptions(max_side=0))
+        self._video = VideoSource(path, SourceOptions(max_side=0), whole=True)
         if self._video.stored_count < first + length:
             raise SourceError(f"{path} ends after {self._video.stored_count} of {first + length} frames; copy it again")
         self.size = self._video.stored_size

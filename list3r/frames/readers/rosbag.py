@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, Listing, Reader, SourceInfo, missing_parts
+from list3r.frames.beside import role_of
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
 from list3r.frames.layout import FolderLayout, Optics
@@ -258,18 +259,34 @@ class _Topics:
         for role, topic in wanted.items():
             if topic not in self._of:
                 raise OptionError(f"--topics {role}={topic}: {path} has {', '.join(sorted(self._of)) or 'no topics'}")
+        pose = wanted.get("pose")
+        if pose is not None and self._of[pose].msgtype not in _POSES:
+            kinds = ", ".join(k.rsplit("/", 1)[-1] for k in _POSES)
+            raise OptionError(
+                f"--topics pose={pose} is {self._of[pose].msgtype}; poses are of {kinds}, or of /tf without it"
+            )
         self._pose_topic = wanted.get("pose") or self._only_pose_topic()
         self._streams, self._tree, self._infos, self._units = self._scan()
 
     def color(self) -> Stream:
         """The pictures. Raises `SourceError` where none or several would fit."""
         found = [s for s in self._streams.values() if not is_depth(s.first)]
+        found = [s for s in found if role_of(s.topic) != "depth"] or found
         return self._choose("color", found, ("color", "rgb"))
 
     def depth(self) -> Stream | None:
         """The depth images, None where there are none."""
         found = [s for s in self._streams.values() if is_depth(s.first)]
-        return self._choose("depth", found, ("aligned_depth", "depth")) if found else None
+        if not found and "depth" not in self._wanted:
+            return None
+        chosen = self._choose("depth", found, ("aligned_depth", "depth"))
+        try:
+            read_depth(chosen.first)
+        except FrameError as error:
+            if "depth" in self._wanted:
+                raise OptionError(f"--topics depth={chosen.topic}: {error}") from None
+            raise SourceError(f"{self._path}: depth of {chosen.topic} cannot be read: {error}") from None
+        return chosen
 
     def transforms(self, frame: str) -> TransformTree:
         """Where things were; a pose of a topic that does not say what it moves is that of the camera's `frame`."""

@@ -28,6 +28,7 @@ from list3r.frames.layout import (
 )
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
+from list3r.frames.recordings.stamps import as_seconds
 from list3r.memory.errors import SourceError
 
 MAX_PAIR_GAP_S = 0.02
@@ -57,7 +58,10 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         depths = _read_list(root / "depth.txt")
         pairs = associate(colors.times_s, depths.times_s, MAX_PAIR_GAP_S)
         if not len(pairs):
-            raise SourceError(f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; fix depth.txt")
+            apart = f"rgb.txt begins at {colors.times_s[0]:.3f} s, depth.txt at {depths.times_s[0]:.3f} s"
+            raise SourceError(
+                f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; fix depth.txt ({apart})"
+            )
         if len(pairs) < len(colors):
             alone = len(colors) - len(pairs)
             notes.append(f"{alone} of {len(colors)} colour images have no depth image of their time and are left out")
@@ -149,13 +153,13 @@ def _read_list(path: Path) -> _TimedNames:
         words = text.split(maxsplit=1)
         try:
             times_s.append(float(words[0]))
-            names += words[1].strip().encode("utf-8")
+            names += words[1].strip().replace("\\", "/").encode("utf-8")
         except (ValueError, IndexError):
             raise SourceError(f"{path}: line {number} is not 'timestamp filename'; fix or remove it") from None
         ends.append(len(names))
     if not times_s:
         raise SourceError(f"{path} names no image; is the copy complete?")
-    found = _TimedNames(np.frombuffer(times_s), bytes(names), np.frombuffer(ends, np.int64))
+    found = _TimedNames(as_seconds(np.frombuffer(times_s))[0], bytes(names), np.frombuffer(ends, np.int64))
     if np.all(np.diff(found.times_s) > 0):
         return found
     rows = sorted((time, found.name(k)) for k, time in enumerate(found.times_s.tolist()))
@@ -169,7 +173,8 @@ def _poses(path: Path, times_s: NDArray[np.float64]) -> Iterator[NDArray[np.floa
     for row in iter_numbers(path) if path.is_file() else ():
         if len(row) >= 8 and all(map(math.isfinite, row[:8])) and max(map(abs, row[1:4])) <= MAX_LENGTH_M:
             numbers.extend(row[:8] if sum(v * v for v in row[4:8]) > 0.5 else ())
-    table = np.frombuffer(numbers).reshape(-1, 8)
+    table = np.frombuffer(numbers).reshape(-1, 8).copy()
+    table[:, 0] = as_seconds(table[:, 0])[0]
     if not len(table):
         yield from repeat(None, len(times_s))
         return

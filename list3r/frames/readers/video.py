@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from itertools import chain, islice, pairwise
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
+from list3r.frames.decoding.shown import LOOKED_AT, check_no_panorama, shown_note, shown_part
 from list3r.frames.decoding.timestamps import list_timestamps, open_container, packets, picture_stream
 from list3r.frames.folder import centred_camera, fingerprint, reduced_note
 from list3r.frames.layout import Optics
@@ -33,10 +35,19 @@ _EARLIER = 4
 class VideoSource(Reader):
     """A `FrameSource` over one video stream. Every `read` opens the file again and seeks to its first frame."""
 
-    def __init__(self, path: Path, options: SourceOptions, *, by_user: bool = True) -> None:
+    def __init__(
+        self,
+        path: Path,
+        options: SourceOptions,
+        *,
+        by_user: bool = True,
+        whole: bool = False,
+        like: VideoSource | None = None,
+    ) -> None:
         """Lists the stream's packets without decoding them, then decodes one frame. Raises `SourceError`.
 
-        `by_user`: the intrinsics of the options are the user's word, not that of a file beside the video.
+        `by_user`: the intrinsics of the options are the user's word, not that of a file beside the video. Black bars
+        are cut off, but for the `whole` picture, or where they are of a video that this one is `like`.
         """
         if options.depth_intrinsics or options.T_color_depth:
             raise OptionError(f"{path} is a video without depth: leave out --depth-intrinsics and --depth-to-color")
@@ -46,7 +57,7 @@ class VideoSource(Reader):
         count = len(self._stamps)
         times_s = self._stamps.times_s(0, count) if self._stamps.clock else np.arange(count) / self._fps
         self._chosen = select(times_s, options, path, clock=self._stamps.clock, video=True)
-        self._upright, self._rig = self._first()
+        self._upright, self._rig = self._first(whole, like)
         self._info = self._describe()
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
@@ -56,7 +67,7 @@ class VideoSource(Reader):
                 yield BadFrame(number, _DAMAGED)
                 continue
             try:
-                color = self._rig.straight(self._upright.color(image, self._rig.color_size))
+                color = self._rig.straight(self._rig.cut(self._upright.color(image, self._rig.whole_size)))
             except FrameError as error:
                 yield BadFrame(number, str(error))
             else:
@@ -166,16 +177,32 @@ class VideoSource(Reader):
     def _time_s(self, number: int) -> float:
         return self._stamps.time_s(number) if self._stamps.clock else number / self._fps
 
-    def _first(self) -> tuple[Upright, Rig]:
+    def _first(self, whole: bool, like: VideoSource | None) -> tuple[Upright, Rig]:
         optics = Optics(self._options.intrinsics, self._options.distortion or (), by_user=self._by_user)
         for _, image in self._decode(int(self._chosen.starts[0])):
             turned = Upright.of(image, self._stamps.aspect)
-            return turned, build_rig(optics, turned.size, None, None, self._options.max_side)
+            shown = like._rig.shown if like is not None else None
+            if like is None and not whole:
+                if self._options.intrinsics is None:
+                    check_no_panorama([turned.color(image, turned.size)], str(self._path))
+                shown = shown_part(self._spread(turned, image))
+            return turned, build_rig(optics, turned.size, None, None, self._options.max_side, shown)
         raise SourceError(f"{self._path}: no frame of it can be decoded; is the copy complete?")
+
+    def _spread(self, turned: Upright, first: av.VideoFrame) -> Iterator[NDArray[np.uint8]]:
+        """Yield whole pictures of places all over the video."""
+        yield turned.color(first, turned.size)
+        for position in np.unique(np.linspace(0, len(self._chosen) - 1, LOOKED_AT).astype(int))[1:].tolist():
+            for _, image in self._decode(self.number(position)):
+                with contextlib.suppress(FrameError):
+                    yield turned.color(image, turned.size)
+                break
 
     def _describe(self) -> SourceInfo:
         rig, notes = self._rig, [*self._upright.notes(), *self._stamps.notes]
-        if rig.color_size != rig.stored_size:
+        if rig.shown is not None:
+            notes.append(shown_note(rig.shown, rig.stored_size))
+        if rig.color_size != rig.shown_size:
             notes.append(reduced_note(rig))
         if not self._stamps.clock:
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
@@ -183,7 +210,7 @@ class VideoSource(Reader):
             notes.append("of each group of frames the sharpest is taken; --no-sharpest takes the first")
         missing = missing_parts(depth=False, camera=rig.camera is not None)
         focal = None if rig.camera is not None else self._stamps.focal_35mm
-        height, width = rig.stored_size
+        height, width = rig.shown_size
         guess = believable(None if focal is None else film_focal(focal, width, height), width, height)
         listing = [(self._path.name, self._path.stat().st_size)]
         return SourceInfo(
@@ -199,7 +226,8 @@ class VideoSource(Reader):
             notes=tuple(notes),
             missing=tuple(missing),
             image_size=rig.color_size,
-            stored_size=rig.stored_size,
+            stored_size=rig.shown_size,
+            corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),
             camera_guess=None if guess is None else centred_camera(guess, rig),
         )
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
 from list3r.frames.layout import Optics
@@ -20,7 +21,7 @@ from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
-from list3r.frames.unread import not_read
+from list3r.frames.unread import not_read, not_read_note
 from list3r.memory.errors import FrameError
 
 _FRAMES_TRIED = 12
@@ -56,7 +57,7 @@ class VideoWithDepth(Reader):
         side = WORKING_SIDES[True] if options.max_side is None else options.max_side
         words = replace(options, kind="auto", intrinsics=parts.intrinsics, max_side=side, depth_scale=None)
         given = options.intrinsics is not None
-        self._video, self._parts = VideoSource(parts.video, words, by_user=given), parts
+        self._video, self._parts = VideoSource(parts.video, words, by_user=given, whole=True), parts
         stored = self._video.stored_size
         scale = options.depth_scale or parts.units_per_m
         lens = options.distortion or ()
@@ -65,7 +66,7 @@ class VideoWithDepth(Reader):
         )
         size = read_raw_depth(next(iter(parts.depth.values()))).shape if parts.depth else None
         self._rig = build_rig(optics, stored, (size[0], size[1]) if size else None, options.max_depth_m, side)
-        self._info = self._describe(root)
+        self._info = self._describe(root, options.kind)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""
@@ -131,8 +132,11 @@ class VideoWithDepth(Reader):
         parts, first = self._parts, min(self._parts.depth, default=0)
         return [parts.video, parts.depth.get(first), parts.confidence(first) if parts.confidence else None]
 
-    def _describe(self, root: Path) -> SourceInfo:
+    def _describe(self, root: Path, asked: str) -> SourceInfo:
         info, parts, registration = self._video.info, self._parts, self._rig.registration
+        left = not_read(root, parts.kind, self._some_files())
+        if asked == "auto":
+            refuse_left(root, parts.kind, left, depth=bool(parts.depth), poses=bool(parts.poses), camera=True)
         turns = turns_in_gravity(list(parts.poses.values())) if parts.z_up else None
         return replace(
             info,
@@ -150,7 +154,7 @@ class VideoWithDepth(Reader):
                 *self._doubts(),
                 *((NOT_STANDING,) if parts.z_up and parts.poses and turns is None else ()),
                 *lying_note(turns or 0),
-                *not_read(root, parts.kind, self._some_files()),
+                *not_read_note(left),
             ),
             missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=turns is not None,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
+from list3r.frames.recordings.rvl import read_rvl
 from list3r.memory.errors import FrameError, SourceError
 
 DEPTH_ENCODINGS = {"16UC1": "<u2", "mono16": "<u2", "32FC1": "<f4"}
@@ -33,7 +34,12 @@ def is_depth(message: Any) -> bool:
     """Return whether an Image or CompressedImage holds depth."""
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
-    return "compressedDepth" in message.format
+    data = bytes(message.data[:26])
+    return (
+        "compressedDepth" in message.format
+        or message.format.split(";")[0].strip() in DEPTH_ENCODINGS
+        or (data.startswith(b"\x89PNG") and data[24:26] == b"\x10\x00")  # one channel of 16 bits
+    )
 
 
 def read_color(message: Any) -> NDArray[np.uint8]:
@@ -51,12 +57,18 @@ def read_color(message: Any) -> NDArray[np.uint8]:
 def read_depth(message: Any) -> NDArray[Any]:
     """Depth as stored: whole millimetres or float metres. Shape (H, W). Raises `FrameError`."""
     if hasattr(message, "encoding"):
+        if message.encoding not in DEPTH_ENCODINGS:
+            raise FrameError(f"pictures of encoding {message.encoding} are no depth ({', '.join(DEPTH_ENCODINGS)} are)")
         kind = np.dtype(DEPTH_ENCODINGS[message.encoding])
         return _rows(message, kind.newbyteorder(">" if message.is_bigendian else "<"), 1).astype(kind)
     data = bytes(message.data)
+    if message.format.rstrip().lower().endswith("rvl"):
+        return read_rvl(data[_PNG_AT:])
     image = _decoded(data[_PNG_AT:] if data[:4] != b"\x89PNG" else data, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise FrameError("a compressed depth image has several channels")
+    if image.dtype == np.uint8:
+        raise FrameError("a compressed image of 8 bits is no depth")
     if not message.format.startswith("32FC1"):
         return image
     _, a, b = struct.unpack("<iff", data[:_PNG_AT])

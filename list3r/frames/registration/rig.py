@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.frames.decoding.decode import clean_depth
+from list3r.frames.decoding.shown import Shown
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.registration.reprojection import DepthReprojection, Undistortion
@@ -66,6 +67,23 @@ class Rig:
     registration: DepthReprojection | None
     shares_view: bool = False
     """Depth is of the colour camera itself, so that a picture with a camera of its own has depth of that camera."""
+    shown: Shown | None = None
+    """The part of the pictures as stored that is handed out; None for all."""
+
+    @property
+    def shown_size(self) -> tuple[int, int]:
+        """(height, width) of what is handed out, in pixels as stored."""
+        return self.stored_size if self.shown is None else self.shown.size
+
+    @property
+    def whole_size(self) -> tuple[int, int]:
+        """(height, width) of the whole pictures at the scale of what is handed out, px."""
+        return _whole_size(self.stored_size, self.shown, self.color_size)
+
+    def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return what is handed out of a picture of `whole_size`. Shape (H, W, 3)."""
+        y, x = _corner(self.stored_size, self.shown, self.color_size)
+        return image[y : y + self.color_size[0], x : x + self.color_size[1]]
 
     def color(self, image: NDArray[np.uint8], lens: Camera | None = None) -> NDArray[np.uint8]:
         """Undistorted colour of a picture, which may have a camera of its own. Shape (H, W, 3).
@@ -76,9 +94,9 @@ class Rig:
             return self._carried(image, lens, self.camera)
         if image.shape[:2] != self.stored_size:
             raise FrameError(f"colour is {_size(image.shape)}, most frames {_size(self.stored_size)}")
-        if self.color_size != self.stored_size:
-            image = np.asarray(cv2.resize(image, self.color_size[::-1], interpolation=cv2.INTER_AREA))
-        return self.straight(image)
+        if self.whole_size != self.stored_size:
+            image = np.asarray(cv2.resize(image, self.whole_size[::-1], interpolation=cv2.INTER_AREA))
+        return self.straight(np.ascontiguousarray(self.cut(image)))
 
     def _carried(self, image: NDArray[np.uint8], lens: Camera, camera: Camera) -> NDArray[np.uint8]:
         """What a camera of its own saw, as the camera of the source would have seen it. Shape (H, W, 3)."""
@@ -122,22 +140,27 @@ def build_rig(
     depth_size: tuple[int, int] | None,
     max_depth_m: float | None,
     max_side: int | None = None,
+    shown: Shown | None = None,
 ) -> Rig:
     """Check the cameras against the first images and tabulate. Raises `SourceError` and `OptionError`.
 
-    Frames larger than `max_side` are reduced, and the camera with them; see `SourceOptions.max_side`.
+    Frames larger than `max_side` are reduced, and the camera with them; see `SourceOptions.max_side`. Of pictures
+    without depth the part that is `shown` is handed out; cameras are stated for the whole.
     """
     if optics.distortion and optics.intrinsics is None:
         raise SourceError("a lens distortion needs a camera; give --intrinsics fx,fy,cx,cy")
     limit = WORKING_SIDES[depth_size is not None] if max_side is None else max_side
-    color_size = working_size(stored_size, limit)
+    color_size = working_size(stored_size if shown is None else shown.size, limit)
     if optics.intrinsics is not None and not optics.by_user:
         _check_size(optics.intrinsics, optics.intrinsics_size or stored_size)
     stated = _camera(optics.intrinsics, optics.intrinsics_size or stored_size, "intrinsics", optics.distortion)
     if stated is not None and optics.fisheye:
         stated = replace(stated, fisheye=True)
     whole = _of_size(stated, stored_size, "the colour pictures")
-    lens = None if whole is None else whole.resized(*color_size)
+    lens = None if whole is None else whole.resized(*_whole_size(stored_size, shown, color_size))
+    if lens is not None and shown is not None:
+        y, x = _corner(stored_size, shown, color_size)
+        lens = replace(lens, width=color_size[1], height=color_size[0], cx=lens.cx - x, cy=lens.cy - y)
     camera = lens.pinhole() if lens else None
     undistortion = Undistortion(lens) if lens and (lens.distortion or lens.fisheye) else None
     registration = None
@@ -146,7 +169,25 @@ def build_rig(
             raise SourceError("the units of the depth images are unknown; give --depth-scale UNITS_PER_METRE")
         registration = _registration(optics, whole, camera, (depth_size, stored_size))
     scale, shared = optics.depth_scale or 1.0, _is_shared(optics)
-    return Rig(camera, stored_size, color_size, depth_size, scale, max_depth_m, undistortion, registration, shared)
+    return Rig(
+        camera, stored_size, color_size, depth_size, scale, max_depth_m, undistortion, registration, shared, shown
+    )
+
+
+def _whole_size(stored: tuple[int, int], shown: Shown | None, size: tuple[int, int]) -> tuple[int, int]:
+    if shown is None:
+        return size
+    scale = size[0] / shown.size[0], size[1] / shown.size[1]
+    return round(stored[0] * scale[0]), round(stored[1] * scale[1])
+
+
+def _corner(stored: tuple[int, int], shown: Shown | None, size: tuple[int, int]) -> tuple[int, int]:
+    """Row and column of the whole pictures where what is handed out begins."""
+    if shown is None:
+        return 0, 0
+    height, width = _whole_size(stored, shown, size)
+    y, x = round(shown.top * height / stored[0]), round(shown.left * width / stored[1])
+    return min(y, height - size[0]), min(x, width - size[1])
 
 
 def _is_shared(optics: Optics) -> bool:

@@ -73,7 +73,10 @@ def estimated_camera(
         else:
             found = module.calibrate_by_map(info.camera, whole.keyframes, settings.models.sfm, stored_px)
     full = found.camera.resized(*size)
-    return SessionCamera((full.fx, full.fy, full.cx, full.cy), tuple(found.camera.distortion), tuple(found.notes))
+    y, x = info.corner
+    return SessionCamera(
+        (full.fx, full.fy, full.cx + x, full.cy + y), tuple(found.camera.distortion), tuple(found.notes)
+    )
 
 
 def is_camera_wanted(info: SourceInfo, options: SourceOptions, settings: BuildSettings) -> bool:

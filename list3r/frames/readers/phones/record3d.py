@@ -12,7 +12,7 @@ import math
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.frames.beside import listed
 from list3r.frames.files import MAX_TEXT_BYTES
-from list3r.frames.layout import VARIES, FolderLayout, Optics, read_json, varies_note
+from list3r.frames.layout import IMAGE_ENDINGS, VARIES, FolderLayout, Optics, read_json, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
@@ -32,6 +33,8 @@ from list3r.memory.unpacking import open_archive, parse_json
 LEAST_CONFIDENCE = 2
 """Only what the sensor is most sure of (stored 0, 1, 2); lesser depth lies along edges."""
 METADATA = "metadata"
+_EXPORT = "metadata.json"
+"""Of an export "EXR + JPG", which has the same table beside `rgb/` and `depth/`."""
 _PICTURE = re.compile(r"rgbd/(\d{1,9})\.jpg")
 _MOST_METADATA = MAX_TEXT_BYTES
 _LEAST_TURN = 1e-4
@@ -101,11 +104,36 @@ class PhoneCamera:
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:
-    """The layout of an unpacked recording, or None for another folder."""
+    """The layout of an unpacked recording or of an export "EXR + JPG", or None for another folder."""
+    if (root / _EXPORT).is_file() and (root / "rgb").is_dir():
+        content = read_json(root / _EXPORT)
+        if isinstance(content, dict) and {"K", "w", "h", "poses"} <= set(content):
+            return _exported(root, content, options)
     if not ((root / METADATA).is_file() and (root / "rgbd").is_dir()):
         return None
     present = {f"rgbd/{p.name}" for p in (root / "rgbd").iterdir()}
     return _layout(root, read_json(root / METADATA), present, lambda name: root / name, options)
+
+
+def _exported(root: Path, content: Mapping[str, Any], options: SourceOptions) -> FolderLayout:
+    """The layout of `rgb/N.jpg`, `depth/N.exr` with `metadata.json`. Raises `SourceError`."""
+    colors = {int(p.stem): p for p in listed(root / "rgb", IMAGE_ENDINGS) if p.stem.isdigit()}
+    if not colors:
+        raise SourceError(f"{root} holds no pictures rgb/N.jpg; is the copy complete?")
+    depths = {int(p.stem): p for p in listed(root / "depth", (".exr", ".npy", ".png")) if p.stem.isdigit()}
+    if (root / "depth").exists() and not set(depths) & set(colors):
+        raise SourceError(f"{root}: depth/ has no N.exr of a picture rgb/N.jpg; copy it again, or export as .r3d")
+    camera, poses, times = PhoneCamera.of(root / _EXPORT, content), _poses(content), content.get("frameTimestamps")
+    files = [
+        FrameFile(
+            colors[k], depths.get(k), None, poses[k] if k < len(poses) else None, _time(times, k, content.get("fps"))
+        )
+        for k in sorted(colors)
+    ]
+    first = next((p for p in poses if p is not None), None)
+    notes = ["camera and poses of Record3D (ARKit), of metadata.json"]
+    layout = camera.layout("record3d", files, first, bool(depths), options, notes)
+    return replace(layout, read=(_EXPORT,))
 
 
 def find_file(path: Path, options: SourceOptions) -> FolderLayout:

@@ -1,0 +1,79 @@
+"""The export "All data" of 3D Scanner App: `frame_N.jpg` with `frame_N.json`, `depth_N.png`, `conf_N.png`, in a folder.
+
+Each JSON has `intrinsics`, nine numbers row by row for the picture beside it, and `cameraPoseARFrame`, camera-to-world
+row by row with ARKit's axes and y up. Depth is in millimetres, confidence 0, 1, 2 or as brightness.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from list3r.frames.beside import listed
+from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read_json, varies_note
+from list3r.frames.listing import FrameFile, FrameFiles
+from list3r.frames.options import SourceOptions, check_intrinsics
+from list3r.frames.recordings.axes import pose_of_arkit
+from list3r.memory.errors import OptionError, SourceError
+
+_PICTURE = re.compile(r"frame_(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
+_LEAST_CONFIDENCE = 1
+
+
+def find(root: Path, options: SourceOptions) -> FolderLayout | None:
+    """The layout, or None for another folder. Raises `SourceError` for cameras that cannot be read."""
+    colors = [p for p in listed(root, (".jpg", ".jpeg", ".png")) if _PICTURE.fullmatch(p.name)]
+    tables = {p: p.with_suffix(".json") for p in colors}
+    if not colors or not any(path.is_file() for path in tables.values()):
+        return None
+    stated = {p: _table(path) for p, path in tables.items() if path.is_file()}
+    known = np.array([row[0] for row in stated.values()])
+    intrinsics = check_intrinsics(np.median(known, axis=0).tolist())
+    spread = float(np.ptp(known[:, 0]) / intrinsics[0])
+    files = FrameFiles(
+        FrameFile(
+            p,
+            _there(root, f"depth_{p.stem[6:]}.png"),
+            T_source_camera=stated[p][1] if p in stated else None,
+            time_s=stated[p][2] if p in stated else None,
+            confidence=_there(root, f"conf_{p.stem[6:]}.png"),
+        )
+        for p in colors
+    )
+    notes = ["cameras and poses of 3D Scanner App (ARKit)"]
+    if spread > VARIES:
+        notes.append(varies_note(spread, carried=False))
+    return FolderLayout(
+        "scannerapp",
+        files,
+        Optics(options.intrinsics or intrinsics, depth_scale=1000.0, shares_view=True),
+        "color",
+        intrinsics,
+        tuple(notes),
+        least_confidence=_LEAST_CONFIDENCE,
+        z_up=True,
+        poses_drift=True,
+        read=("info.json", *(path.name for path in tables.values())),
+        upright_tags=False,
+    )
+
+
+def _there(root: Path, name: str) -> Path | None:
+    path = root / name
+    return path if path.is_file() else None
+
+
+def _table(path: Path) -> tuple[list[float], Any, float | None]:
+    """fx, fy, cx, cy, the pose and seconds of a picture. Raises `SourceError`."""
+    content: Any = read_json(path)
+    try:
+        k = [float(v) for v in np.ravel(content["intrinsics"])]
+        T = pose_matrix(float(v) for v in np.ravel(content["cameraPoseARFrame"]))
+        camera = check_intrinsics([k[0], k[4], k[2], k[5]])
+        time_s = float(content["time"]) if "time" in content else None
+    except (KeyError, TypeError, ValueError, IndexError, OptionError):
+        raise SourceError(f"{path} lacks intrinsics or cameraPoseARFrame of 3D Scanner App; export it again") from None
+    return list(camera), None if T is None else pose_of_arkit(T), time_s
