@@ -9,7 +9,7 @@ from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.find import meant
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.finding.grammar import parse
+from list3r.queries.finding.grammar import Phrase, parse
 from list3r.queries.finding.words import STRUCTURE, no_such_words, wanted_words, word_score
 from list3r.queries.match import Filters
 from list3r.queries.views.gather import is_large, sample
@@ -29,8 +29,8 @@ def named_by(
     notes: list[str],
 ) -> list[tuple[Instance, float, str]]:
     """Return what the words say, with how well and why: a phrase as `find` reads it, else things that have them."""
-    if _says_more_than_names(words):
-        found, search = meant(store, parse(words), encoder=encoder)
+    if (phrase := _more_than_names(words)) is not None:
+        found, search = meant(store, phrase, encoder=encoder)
         notes += search.notes
         return [(c.instance, c.score, "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
     others = [i for i in _with_words(store, words, filters, notes) if origin is None or i.id != origin.id]
@@ -42,17 +42,16 @@ def named_by(
     return named
 
 
-def _says_more_than_names(words: str) -> bool:
-    try:
-        phrase = parse(words)
-    except OptionError:  # such as "mug on": a name that ends in a relation
-        return False
-    return bool(phrase.where or phrase.size or phrase.superlative or phrase.instance_id is not None)
+def _more_than_names(words: str) -> Phrase | None:
+    """Return the phrase of words that say more than names; None where they only name."""
+    phrase = parse(words).phrases[0]
+    more = phrase.where or phrase.size or phrase.order or phrase.use or phrase.instance_id is not None
+    return phrase if more else None
 
 
 def only_common(store: Store, words: str) -> bool:
     """Tell whether the words only name, and so many have them that it is better to look around than at all of them."""
-    if _says_more_than_names(words):
+    if _more_than_names(words) is not None:
         return False
     return len(store.words.bearing(wanted_words(words), _LOADED + 1)[0]) > _LOADED
 

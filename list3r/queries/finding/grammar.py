@@ -1,82 +1,51 @@
-"""The grammar of `find`: [attributes] noun [relation [attributes] noun [relation ...]].
+"""The grammar of `find`: a question as people ask it, read into a frozen `Question`.
 
-    white mug on table          chair next to 12          the biggest red thing near the door
-    small box in the cabinet    mugs left of the laptop   lamp between 4 and the sofa
+    white mug on table              where did I leave the remote control?     something to sit on
+    how many chairs are there?      is there a lamp on the desk?              chair closest to the door
+    second chair from the left      the chair that is not brown               plates and forks on the table
+    lamp between 4 and the sofa     what is left of the sofa seen from the door?
 
-A phrase is what stands before, between and after relations: words that a thing must bear, words of size, and the
-number of an instance instead of all that. Relations bind to the right: in "mug on the table near the door" the table
-is the one near the door; "and" binds what follows to the first thing again: "mug on the table and next to 12".
+First words become tokens: fillers go, and the longest phrase of the table `phrases.json`, or of the names of nouns in
+any language, is one token. Then `_Reader` reads: a question is phrases joined by "and" or "or", then clauses; a phrase
+is attributes, a noun, an order ("largest", "second from the left"), a use, or the number of an instance. Clauses bind
+to the right: in "mug on the table near the door" the table is near the door; after "and" they bind to the first again.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
+from list3r.memory.description.nouns import all_nouns, names, unaccented
 from list3r.memory.description.words import split_words
 from list3r.memory.errors import OptionError
 
-RELATIONS: dict[str, tuple[str, ...]] = {
-    "on top of": ("on",),
-    "hanging on": ("attached_to",),
-    "mounted on": ("attached_to",),
-    "attached to": ("attached_to",),
-    "fixed to": ("attached_to",),
-    "sitting on": ("on",),
-    "standing on": ("on",),
-    "lying on": ("on",),
-    "on": ("on", "attached_to"),
-    "upon": ("on",),
-    "at": ("on", "attached_to", "next_to", "near"),
-    "inside of": ("in",),
-    "inside": ("in",),
-    "into": ("in",),
-    "in": ("in",),
-    "under": ("under", "below"),
-    "underneath": ("under", "below"),
-    "beneath": ("under", "below"),
-    "below": ("under", "below"),
-    "above": ("above",),
-    "over": ("above",),
-    "next to": ("next_to",),
-    "adjacent to": ("next_to",),
-    "beside": ("next_to",),
-    "alongside": ("next_to",),
-    "close to": ("next_to", "near"),
-    "near to": ("next_to", "near"),
-    "near": ("next_to", "near"),
-    "nearby": ("next_to", "near"),
-    "by": ("next_to", "near"),
-    "supporting": ("supports",),
-    "supports": ("supports",),
-    "contains": ("contains",),
-    "carrying": ("supports",),
-    "containing": ("contains",),
-    "with": ("supports", "contains"),
-    "to the left of": ("left_of",),
-    "left of": ("left_of",),
-    "to the right of": ("right_of",),
-    "right of": ("right_of",),
-    "in front of": ("in_front_of",),
-    "behind": ("behind",),
-    "between": ("between",),
-}
-"""What people say, and the predicates that it may mean."""
-_PHRASES: dict[tuple[str, ...], tuple[str, ...]] = {tuple(text.split()): meant for text, meant in RELATIONS.items()}
-_LONGEST = max(len(p) for p in _PHRASES)
-
-GENERIC = frozenset("thing object item something anything everything stuff one what which".split())
-"""Words that name nothing in particular."""
-_FILLERS = frozenset(
-    "a an the my your our this that these those some any all is are of find show me please there".split()
-)
-_VERBS = frozenset("standing sitting lying placed located stands sits lies".split())
-
+_BOUNDS = {"floor", "wall", "ceiling"}
+"""What bounds a room: what is said after one is seldom said of it."""
+_MOST_WORDS = 64
+_LONGEST = 7
+"""Words of the longest phrase."""
 SIZES = {"tiny": (0.0, 0.25), "small": (0.0, 0.5), "medium": (0.2, 0.8), "large": (0.5, 1.0), "huge": (0.75, 1.0)}
 """Words of size, and which part they are of what there is, ordered by size."""
-SUPERLATIVES = {"biggest": 1, "largest": 1, "longest": 1, "smallest": -1, "tiniest": -1, "tallest": 2, "shortest": -2}
-"""1 and -1 by the longest edge, 2 and -2 by height."""
-_MOST_WORDS = 64
+_WHERE = ("where", "wo", "où", "dónde", "donde", "dove")
+_ASIAN = r"\u3040-\u30ff\u3400-\u9fff"
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which of several: "largest", "second from the left", "closest to the door"."""
+
+    by: str
+    """A key of `orders` in phrases.json."""
+    rank: int = 1
+    """Counted from 1; -1 for the last."""
+    to: Phrase | None = None
+    """What `nearest` and `farthest` are measured from."""
 
 
 @dataclass(frozen=True)
@@ -85,101 +54,428 @@ class Phrase:
 
     text: str
     words: tuple[str, ...] = ()
-    """What it must bear, singular and in the words of `words`."""
+    """What it must bear beside its name, as `split_words` has them."""
+    noun: tuple[str, ...] = ()
+    """The words that name it, as `split_words` has them."""
+    meant: tuple[str, ...] = ()
+    """The nouns of the table that those words mean; empty for a name that is not in it."""
+    use: str | None = None
+    """What one does with it."""
     size: str | None = None
-    superlative: str | None = None
+    order: Order | None = None
     instance_id: int | None = None
     where: tuple[Clause, ...] = ()
     """How it stands to others; all must hold."""
+    change: str | None = None
+    """moved, removed, added or changed."""
+
+    @property
+    def all_words(self) -> tuple[str, ...]:
+        """Attributes and name."""
+        return tuple(dict.fromkeys((*self.words, *self.noun)))
+
+    @property
+    def ellipsis(self) -> bool:
+        """Whether its noun is left out: "the red one"."""
+        return not self.noun and self.text.split()[-1:] in (["one"], ["ones"])
+
+    @property
+    def generic(self) -> bool:
+        """Whether it names nothing in particular."""
+        return not (self.words or self.noun or self.use or self.instance_id is not None)
 
 
 @dataclass(frozen=True)
 class Clause:
-    """A relation to something."""
+    """A relation to something, or what something is not: then there are no predicates."""
 
     wording: str
     predicates: tuple[str, ...]
     object: Phrase
     other: Phrase | None = None
     """The second of two, for between."""
+    negated: bool = False
 
 
-def parse(text: str) -> Phrase:
-    """Parse a question. Raises `OptionError` for one that is empty, too long, or ends in a relation."""
-    tokens = re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text.lower())  # names of predicates (next_to) come apart
-    if not tokens:
+@dataclass(frozen=True)
+class Question:
+    """What is asked."""
+
+    text: str
+    kind: str
+    """which, where, count or exists."""
+    phrases: tuple[Phrase, ...]
+    """What is asked for: what any of them means answers."""
+    every: bool = False
+    """Whether all of the phrases must be there for a yes."""
+    at_least: int = 1
+    """How many must be there for a yes."""
+    seen_from: Phrase | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Token:
+    kind: str
+    """word, noun, thing, relation, order, rank, size, number, use, change, and, or, not."""
+    text: str
+    value: Any = None
+
+
+@cache
+def _table() -> dict[str, Any]:
+    table: dict[str, Any] = json.loads(Path(__file__).with_name("phrases.json").read_text(encoding="utf-8"))
+    return table
+
+
+@cache
+def _phrases() -> dict[tuple[str, ...], _Token]:
+    """Return the tokens of all words and phrases of the table that are more than names."""
+    table, out = _table(), {}
+    out |= {tuple(_words(p)): _Token("filler", p) for p in (*table["fillers"].split(), *table["phrases"].split("|"))}
+    out |= {(w,): _Token("thing", w) for w in table["generic"].split()}
+    for kind in ("and", "or", "not"):
+        out |= {(w,): _Token(kind, w) for w in table[kind].split()}
+    for kind, group in (("order", "orders"), ("relation", "relations"), ("change", "changes")):
+        out |= {tuple(_words(p)): _Token(kind, p, key) for key, many in table[group].items() for p in many.split("|")}
+    out |= {(w,): _Token("rank", w, n) for w, n in table["ranks"].items()}
+    return out
+
+
+@cache
+def relation_words() -> dict[str, tuple[str, ...]]:
+    """Return what people say of how things stand to each other, and the predicates that it may mean."""
+    said = _table()["relations"].items()
+    return {phrase: tuple(_table()["predicates"][key]) for key, many in said for phrase in many.split("|")}
+
+
+@cache
+def _openings(name: str) -> frozenset[tuple[str, ...]]:
+    said: Iterable[str] = _table()[name].split("|") if isinstance(_table()[name], str) else _table()[name]
+    return frozenset(tuple(_words(p)) for p in said)
+
+
+def _words(text: str) -> list[str]:
+    """Return words as they stand, short forms in full; what is written without spaces comes apart at known nouns."""
+    text = re.sub(r"[’`]", "'", text.lower())
+    text = re.sub(r"\bcan't\b", "can not", re.sub(r"n't\b", " not", text))
+    text = re.sub(r"\b(what|where|who|which|that|there|it|how|here)'s\b", r"\1 is", text).replace("i'm ", "i am ")
+    text = re.sub(r"'s\b", "", text)
+    text = re.sub(f"[{_ASIAN}]+", lambda found: f" {' '.join(_apart(found[0]))} ", text)
+    return re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text)
+
+
+def _apart(run: str) -> list[str]:
+    """Return the words of Japanese or Chinese that the tables know, the one spoken of before what it is next to."""
+    for particle, relation in _table()["asian"].items():
+        before, found, after = run.partition(particle)
+        if found and before and after:
+            return [*_apart(after), *relation.split(), *_apart(before)]
+    out, k = [], 0
+    while k < len(run):
+        known = (run[k:end] for end in range(len(run), k, -1))
+        word = next((w for w in known if (w,) in names() or split_words(w) != [w]), None)
+        out += [] if word is None else [word]
+        k += 1 if word is None else len(word)
+    return out
+
+
+def parse(text: str) -> Question:
+    """Read a question. Raises `OptionError` for a text without a letter or a digit; anything else is a question."""
+    words = _words(text)
+    if not re.search(r"[^\W_]", text):
         raise OptionError(f"{text!r} has no word to search for; ask for something such as: white mug on table")
-    if len(tokens) > _MOST_WORDS:
-        raise OptionError(f"a question of {len(tokens)} words is too long; {_MOST_WORDS} are the most")
-    return _sentence(tokens, text)
+    notes = []
+    if len(words) > _MOST_WORDS:
+        notes.append(f"the question has {len(words)} words; the first {_MOST_WORDS} were read")
+        words = words[:_MOST_WORDS]
+    words, place = _split_off(words, _openings("seen_from"))
+    kind, words = _kind(words)
+    at_least = 1
+    if kind == "exists" and words:
+        more, words = ("more" in words[:1]), [w for w in words if w not in ("more", "than")]
+        number = _table()["numbers"].get(words[0], words[0]) if words else ""
+        if str(number).isdigit() and len(words) > 1:
+            at_least, words = int(number) + more, words[1:]
+    reader = _Reader(_tokens(words))
+    phrases, every = reader.question()
+    seen_from = _Reader(_tokens(place)).question()[0][0] if place else None
+    if reader.places:
+        notes.append(f"rooms are not told apart: {reader.places[0]!r} was left out")
+    return Question(text, kind, phrases, every, at_least, seen_from, tuple(notes))
 
 
-def _sentence(tokens: list[str], text: str) -> Phrase:
-    """Return the first phrase with its clauses; "and" before a relation comes back to it."""
-    start = next((n for n in range(len(tokens)) if _relation_at(tokens, n)[0]), None)
-    head = _phrase(tokens[: start if start is not None else len(tokens)])
-    clauses: list[Clause] = []
-    while start is not None:
-        end = _next_and(tokens, start)
-        clauses.append(_clause(tokens[start:end], text))
-        start = None if end >= len(tokens) else end + 1
-    return Phrase(head.text, head.words, head.size, head.superlative, head.instance_id, tuple(clauses))
+def _split_off(words: list[str], marks: frozenset[tuple[str, ...]]) -> tuple[list[str], list[str]]:
+    """Return the words before and after the first of some marks."""
+    for k in range(len(words)):
+        for length in range(_LONGEST, 0, -1):
+            if tuple(words[k : k + length]) in marks:
+                return words[:k], words[k + length :]
+    return words, []
 
 
-def _clause(tokens: list[str], text: str) -> Clause:
-    length, predicates = _relation_at(tokens, 0)
-    words, rest = " ".join(tokens[:length]), tokens[length:]
-    if predicates == ("between",):
-        if "and" not in rest:
-            raise OptionError(f"{text!r}: between needs two things, such as: between 4 and the sofa")
-        middle = rest.index("and")
-        one, two = rest[:middle], rest[middle + 1 :]
-    else:
-        one, two = rest, []
-    for part in (one, *([two] if predicates == ("between",) else [])):
-        if not [t for t in part if t not in _FILLERS]:
-            raise OptionError(f"{text!r}: say what it should be {words}, such as: mug {words} table")
-    other = _sentence(two, text) if two else None
-    return Clause(words, predicates, _sentence(one, text), other)
+def _kind(words: list[str]) -> tuple[str, list[str]]:
+    """Return what kind of question begins so, and the words after its opening."""
+    kind, asks = "which", {"counts": "count", "yes_no": "exists", "openers": ""}
+    while words:
+        length, name = max((_opening(words, _openings(n)), n) for n in asks)
+        if not length or (asks[name] and kind == "where"):
+            break
+        if asks[name]:
+            return asks[name], words[length:]
+        if words[0] in _WHERE:
+            kind = "where"
+        if words[0] in _WHERE + ("what", "which") and _use_at(words, length)[0]:
+            return "which", words[length:]
+        words = words[length:]
+        words = words[1:] if words and words[0] in ("me", "the", "is", "are") and len(words) > 1 else words
+    return kind, words
 
 
-def _phrase(tokens: list[str]) -> Phrase:
-    words: list[str] = []
-    size = superlative = number = None
-    for token in tokens:
-        if re.fullmatch(r"#?[0-9]+", token):
-            number = int(token.removeprefix("#")[:30])
-        elif token in SUPERLATIVES:
-            superlative = token
-        elif token not in _FILLERS and token not in _VERBS and token != "and":
-            word = split_words(token)[0]
-            if word in SIZES:
-                size = word
-            elif word not in GENERIC:
-                words.append(word)
-    rest = " ".join(t for t in tokens if t not in _FILLERS)
-    return Phrase(rest or "anything", tuple(dict.fromkeys(words)), size, superlative, number)
+def _opening(words: list[str], openings: frozenset[tuple[str, ...]]) -> int:
+    return next((n for n in range(min(_LONGEST, len(words)), 0, -1) if tuple(words[:n]) in openings), 0)
 
 
-def _relation_at(tokens: list[str], k: int) -> tuple[int, tuple[str, ...]]:
-    """Return (how many words, predicates) of the longest relation that begins at a word; 0 words for none."""
-    for length in range(min(_LONGEST, len(tokens) - k), 0, -1):
-        words = tuple(tokens[k : k + length])
-        if words in _PHRASES:
-            return length, _PHRASES[words]
-        without = tuple(t for t in words if t != "the")
-        if length > 1 and without != words and without in _PHRASES and words[0] != "the" and words[-1] != "the":
-            return length, _PHRASES[without]
-    return 0, ()
+# ---------------------------------------------------------------------------------------------- tokens
 
 
-def _next_and(tokens: list[str], start: int) -> int:
-    """Return where the clause that begins at `start` ends: at an "and" that a relation follows, or at the end."""
-    length, predicates = _relation_at(tokens, start)
-    spared = predicates == ("between",)
-    for n in range(start + length, len(tokens)):
-        if tokens[n] == "and" and spared:
-            spared = False
-        elif tokens[n] == "and" and n + 1 < len(tokens) and _relation_at(tokens, n + 1)[0]:
-            return n
-    return len(tokens)
+def _tokens(words: list[str]) -> list[_Token]:
+    out: list[_Token] = []
+    k = 0
+    while k < len(words):
+        length, token = _token_at(words, k)
+        if token.kind != "filler":
+            out.append(token)
+        k += length
+    return out
+
+
+def _token_at(words: list[str], k: int) -> tuple[int, _Token]:
+    """Return the longest token that begins at a word: a use, a phrase of the table, a noun, or the word alone."""
+    length, use = _use_at(words, k)
+    if use:
+        return length, _Token("use", " ".join(words[k : k + length]), use)
+    if re.fullmatch(r"#?[0-9]+", words[k]):
+        return 1, _Token("number", words[k], int(words[k].removeprefix("#")[:30]))
+    phrases = _phrases()
+    for n in range(min(_LONGEST, len(words) - k), 0, -1):
+        part = tuple(words[k : k + n])
+        without = tuple(w for w in part if w not in ("the", "a"))
+        shaded = n == 1 and part[0] in ("light", "dark") and split_words(" ".join(words[k + 1 : k + 2]))
+        if shaded and shaded[0] in ("blue", "red", "green", "grey", "brown", "yellow"):
+            return 1, _Token("word", part[0], part[0])
+        if part in phrases or (n > 2 and part[0] != "the" and part[-1] != "the" and without in phrases):
+            return n, phrases.get(part) or phrases[without]
+        meant = _meant(part)
+        if meant:
+            return n, _Token("noun", " ".join(part), meant)
+    word = split_words(words[k])[0]
+    if word in _table()["generic"].split():
+        return 1, _Token("thing", word)
+    return 1, _Token("size" if word in SIZES else "word", words[k], word)
+
+
+def _meant(part: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the nouns that words mean: as they stand, singular, without accents, or without a German plural's end."""
+    table = names()
+    found = (*table.get(part, ()), *table.get(tuple(split_words(" ".join(part))), ()))
+    if not found and len(part) == 1 and len(part[0]) > 4 and split_words(part[0]) == [part[0]]:
+        plain = unaccented(part[0])
+        ends = (plain, *(plain.removesuffix(e) for e in ("e", "er", "en", "n") if part[0] != plain or e in ("en", "n")))
+        found = next((table[(w,)] for w in ends if (w,) in table), ())
+    return tuple(dict.fromkeys(found))
+
+
+@cache
+def _uses() -> dict[tuple[str, ...], tuple[str, ...]]:
+    """Return the nouns by the words of a use."""
+    out: dict[tuple[str, ...], list[str]] = {}
+    for n in all_nouns().values():
+        for use in n.uses:
+            out.setdefault(_content(use.split()), []).append(n.name)
+    return {words: tuple(found) for words, found in out.items()}
+
+
+def _content(words: Iterable[str]) -> tuple[str, ...]:
+    idle = ("the", "a", "an", "my", "one's", "some", "one", "s", "our", "your", "down", "up", "any", "oneself")
+    return tuple(split_words(" ".join(w for w in words if w not in idle)))
+
+
+def _use_at(words: list[str], k: int) -> tuple[int, tuple[str, ...]]:
+    """Return (how many words, the nouns) of a use that begins at a word: "to sit on", "I can write at"."""
+    start = _opening(words[k:], _openings("can"))
+    rest = words[k + start :]
+    if not start or not rest:
+        return 0, ()
+    uses = _uses()
+    for n in range(min(_LONGEST, len(rest)), 0, -1):
+        if found := uses.get(_content(rest[:n])):
+            return start + n, found
+    end = next((n for n in range(1, len(rest)) if _phrases().get((rest[n],), _Token("", "")).kind in _ENDS), len(rest))
+    said = _content(rest[:end])
+    verb = said[0] if said else ""
+    if words[k] == "for":
+        verb = verb.removesuffix("ing")
+    alike = {use: len(set(said) & set(use)) for use in uses if use[0] == verb and verb not in ("have", "be")}
+    most = max(alike.values(), default=0)
+    best = [n for use, shared in alike.items() if shared == most for n in uses[use]]
+    return (start + end, tuple(dict.fromkeys(best))) if best else (0, ())
+
+
+_ENDS = ("relation", "and", "or", "not", "order")
+
+
+# ---------------------------------------------------------------------------------------------- phrases
+
+
+class _Reader:
+    """Reads tokens into phrases and clauses, left to right."""
+
+    def __init__(self, tokens: list[_Token]) -> None:
+        self._tokens = tokens
+        self._at = 0
+        self.places: list[str] = []
+        """Rooms that were named."""
+
+    def question(self) -> tuple[tuple[Phrase, ...], bool]:
+        """Return the phrases that answer, and whether all of them are asked for."""
+        if len(self._tokens) > 1 and self._tokens[-1].kind == "relation" and self._tokens[-1].value not in ("at", "near"):
+            return (self._inverted(),), False
+        heads, every = [self._phrase()], True
+        while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
+            every &= self._take().kind == "and"
+            heads.append(self._phrase())
+        clauses = self._clauses(heads[0])
+        while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
+            self._take()  # mug on the table or bowl on the desk
+            heads[-1] = replace(heads[-1], where=(*heads[-1].where, *clauses))
+            heads.append(self._phrase())
+            clauses = self._clauses(heads[-1])
+            heads[-1], clauses = replace(heads[-1], where=clauses), ()
+        if clauses:
+            heads = [replace(h, where=(*h.where, *clauses)) for h in heads]
+        return tuple(heads), every and len(heads) > 1
+
+    def _inverted(self) -> Phrase:
+        """Return what something else stands to as is said last: "what is the cat lying on"."""
+        relation = self._tokens.pop()
+        things = [t for t in self._tokens if t.kind != "thing"]
+        subject = _Reader(things or self._tokens).question()[0][0]
+        inverse = {"on": ("supports",), "in": ("contains",), "under": ("above",), "above": ("under", "below")}
+        predicates = inverse.get(relation.value) or tuple(_table()["predicates"][relation.value])
+        return Phrase("anything", where=(Clause(f"with something {relation.text}", predicates, subject),))
+
+    def _next(self, ahead: int = 0) -> str:
+        at = self._at + ahead
+        return self._tokens[at].kind if at < len(self._tokens) else ""
+
+    def _take(self) -> _Token:
+        self._at += 1
+        return self._tokens[self._at - 1]
+
+    def _clauses(self, head: Phrase) -> tuple[Clause, ...]:
+        """Return clauses as long as there are any; "and" and "or" before a relation come back to the first phrase."""
+        out: list[Clause] = []
+        while self._next() and not (self._next() in ("and", "or") and self._next(1) not in ("relation", "not", "")):
+            token = self._take()
+            if token.kind == "not":
+                out += self._negation(head)
+            elif token.kind == "relation":
+                out += self._relation(token, head)
+            elif token.kind not in ("and", "or"):
+                self._at -= 1
+                more = self._phrase()  # a word that stands after a clause: the lamp on the desk there
+                if self._at < len(self._tokens) and more.generic and more.order is None:
+                    self._at += 1
+        return tuple(out)
+
+    def _relation(self, token: _Token, head: Phrase, *, negated: bool = False) -> list[Clause]:
+        predicates = tuple(_table()["predicates"][token.value])
+        first = self._phrase(several=False)
+        other = None
+        if token.value == "between":
+            if self._next() == "and":
+                self._take()
+                other = self._phrase(several=False)
+            elif first.generic:
+                return []
+        if first.generic and first.order is None and (first.text in _table()["places"].split() or not first.text):
+            if first.text:
+                self.places.append(first.text)
+            return []
+        if first.ellipsis:
+            first = replace(first, noun=head.noun, meant=head.meant)
+        if not negated and self._next() == "relation" and not set(first.meant) & _BOUNDS:
+            first = replace(first, where=self._clauses(first))
+        return [Clause(token.text, predicates, first, other, negated)]
+
+    def _negation(self, head: Phrase) -> list[Clause]:
+        """Return what must not hold: a relation, or to be what a phrase says, whose noun may be left out."""
+        if self._next() == "relation":
+            return self._relation(self._take(), head, negated=True)
+        out = []
+        while True:
+            phrase = self._phrase(several=False)
+            if self._next() == "relation":
+                phrase = replace(phrase, where=tuple(self._relation(self._take(), phrase)))
+            if not phrase.generic or phrase.where or phrase.order:
+                out.append(Clause("not", (), phrase, negated=True))
+            if self._next() not in ("and", "or", "not"):
+                return out
+            self._take()
+
+    def _phrase(self, *, several: bool = True) -> Phrase:
+        """Return attributes, noun, order and use up to a clause or a join."""
+        words: list[str] = []
+        noun: _Token | None = None
+        out, text, generic = Phrase(""), [], False
+        rank: int | None = None
+        while (kind := self._next()) and kind not in ("and", "or", "not", "relation"):
+            token = self._take()
+            text.append(token.text)
+            if kind == "noun":
+                words += _name(noun) if noun is not None else ()
+                noun = token
+            elif kind == "word":
+                words.append(token.value)
+            elif kind == "thing":
+                generic = token.text in ("thing", "one", "object", "item", "piece")
+            elif kind == "size":
+                out = replace(out, size=token.value)
+            elif kind == "number":
+                out = replace(out, instance_id=token.value)
+            elif kind == "change":
+                out = replace(out, change=token.value)
+            elif kind == "use":
+                out = replace(out, use=token.text, meant=token.value)
+            elif kind == "rank":
+                rank = token.value
+                out = replace(out, order=replace(out.order, rank=rank)) if out.order else out
+            elif kind == "order" and several | (token.value not in ("higher",)):
+                out = replace(out, order=self._order(token, rank))
+                if out.order and out.order.to is not None:
+                    break
+        if noun is not None and generic and not words:
+            words, noun = [*words, *_name(noun)], None  # the orange one
+        if noun is not None and out.use is None:
+            out = replace(out, noun=_name(noun), meant=noun.value)
+        elif noun is not None:
+            words += _name(noun)
+        places = _table()["places"].split()
+        kept = [w for w in dict.fromkeys(words) if w not in places]
+        if len(kept) < len(words) and not (kept or out.noun or out.use or out.order) and out.instance_id is None:
+            return replace(out, text=words[0])
+        return replace(out, text=" ".join(text) or "", words=tuple(kept))
+
+    def _order(self, token: _Token, rank: int | None) -> Order:
+        to = None
+        if token.value in ("nearest", "farthest") and self._next() in ("noun", "word", "number", "size", "order", "rank"):
+            to = self._phrase(several=False)
+        elif token.value in ("nearest", "farthest") and self._next() == "relation":
+            self._at += self._tokens[self._at].value in ("near", "at")
+            to = self._phrase(several=False)
+        return Order(token.value, rank or 1, to)
+
+
+def _name(token: _Token) -> tuple[str, ...]:
+    return tuple(split_words(token.text))
