@@ -101,7 +101,7 @@ def _solid(center: Array, size: Array) -> list[OrientedBox]:
 
 def _table(center: Array, size: Array, leg_m: float = 0.05) -> list[OrientedBox]:
     """Return a top and four legs: other things stand under it."""
-    top = OrientedBox(center + (0, 0, (size[2] - leg_m) / 2), np.array([size[0], size[1], leg_m]), np.eye(3))
+    top = OrientedBox(center + np.array([0, 0, (size[2] - leg_m) / 2]), np.array([size[0], size[1], leg_m]), np.eye(3))
     corners = [np.array([i, j, 0]) * (size - leg_m) / 2 for i in (-1, 1) for j in (-1, 1)]
     return [top, *(OrientedBox(center + c, np.array([leg_m, leg_m, size[2]]), np.eye(3)) for c in corners)]
 

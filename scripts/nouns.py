@@ -84,7 +84,8 @@ def main() -> None:
     with HAND.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file, delimiter="|", quoting=csv.QUOTE_NONE))
     taken = {w for r in rows for w in [r["name"], *r["synonyms"].split(",")]}
-    sense = {r["name"]: wordnet.sense(r["name"], r["broader"].split(",")) for r in rows if r["name"] not in _OTHER_SENSE}
+    meant = [r for r in rows if r["name"] not in _OTHER_SENSE]
+    sense = {r["name"]: wordnet.sense(r["name"], r["broader"].split(",")) for r in meant}
     name_of = {s: name for name, s in sense.items() if s is not None}
     kinds = {r["name"]: [b for b in r["broader"].split(",") if b] for r in rows}
     for row in rows:

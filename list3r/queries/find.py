@@ -48,11 +48,24 @@ class Found(Matches):
         """How many there are, for a question that asks so."""
         self.answer: str | None = None
         """yes or no, for a question that asks so; None too where the memory cannot know it."""
+        self.mentioned: dict[int, float] = {}
+        """Ids of all that the question names, the table of "mug on the table" too, with how well."""
 
     @property
     def ambiguous(self) -> bool:
         """Whether the second answer is as good as the first."""
         return len(self) > 1 and self[0].score - self[1].score < _EQUAL
+
+    def facts(self) -> dict[str, object]:
+        """Return what is said of the answer as a whole, for machines."""
+        return {
+            "total": self.total,
+            "count": self.counted,
+            "answer": self.answer,
+            "exact": self.exact,
+            "ambiguous": self.ambiguous,
+            "unknown_words": self.unknown_words,
+        }
 
 
 @of_one_state
@@ -81,15 +94,15 @@ def find(
         found.counted = found.total if found.exact else 0
     if question.kind == "where" and found.exact:
         found[:] = [_placed(store, m) for m in found]
+    found.mentioned |= {m.instance.id: m.score for m in found}
     found.notes = tuple(dict.fromkeys((*found.notes, *question.notes)))
     return found
 
 
-def _asked(
-    store: Store, question: Question, k: int, viewpoint: Place | None, encoder: WordEncoder | None
-) -> Found:
+def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, encoder: WordEncoder | None) -> Found:
     notes: list[str] = []
     unknown: list[str] = []
+    mentioned: dict[int, float] = {}
     if question.seen_from is not None and viewpoint is None:
         seen_from, _ = meant(store, question.seen_from)
         viewpoint = seen_from[0].instance.id if seen_from else None
@@ -104,6 +117,7 @@ def _asked(
         undecided, by_look = undecided or search.undecided, by_look or search.by_look
         notes += search.notes
         unknown += search.unknown
+        mentioned |= search.mentioned
         for c in found:
             if c.instance.id not in best or best[c.instance.id].score < c.score:
                 best[c.instance.id] = c
@@ -113,7 +127,7 @@ def _asked(
     ranked = sorted(best.values(), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
     matches = [Match(c.instance, round(c.score, 4), None, None, _reason(c)) for c in ranked[:k]]
     out = Found(matches, notes, unknown, len(ranked))
-    out.exact = exact
+    out.exact, out.mentioned = exact, mentioned
     if question.kind == "exists":
         yes = all(fits) if question.every else any(fits)
         out.answer = "yes" if yes else None if undecided else "no"
@@ -232,8 +246,11 @@ def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
             continue
         hit = related(search, found, clause, ends, phrase.text, silent=True) if clause.predicates else ends[0]
         gone = {c.instance.id for c in hit}
-        found = [PhraseMatch(c.instance, c.score, (*c.reasons, f"not {clause.object.text}")) for c in found
-                 if c.instance.id not in gone]
+        found = [
+            PhraseMatch(c.instance, c.score, (*c.reasons, f"not {clause.object.text}"))
+            for c in found
+            if c.instance.id not in gone
+        ]
     if phrase.order is not None and found:
         to = _meaning(search, phrase.order.to) if phrase.order.to is not None else []
         found = ordered(search, found, phrase.order, to)
@@ -292,6 +309,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
                 out.append(PhraseMatch(i, score, (why_named(phrase, i, kind=nouns != phrase.meant),)))
         kept = [c for c in out if c.instance.structure is None or bound]
         if kept or out:
+            search.mentioned |= {c.instance.id: c.score for c in kept or out}
             return kept or out
     if len(phrase.all_words) > 1:
         said = ", ".join(repr(w) for w in phrase.all_words)

@@ -131,7 +131,8 @@ def _table() -> dict[str, Any]:
 @cache
 def _phrases() -> dict[tuple[str, ...], _Token]:
     """Return the tokens of all words and phrases of the table that are more than names."""
-    table, out = _table(), {}
+    table = _table()
+    out: dict[tuple[str, ...], _Token] = {}
     out |= {tuple(_words(p)): _Token("filler", p) for p in (*table["fillers"].split(), *table["phrases"].split("|"))}
     out |= {(w,): _Token("thing", w) for w in table["generic"].split()}
     for kind in ("and", "or", "not"):
@@ -225,7 +226,7 @@ def _kind(words: list[str]) -> tuple[str, list[str]]:
             return asks[name], words[length:]
         if words[0] in _WHERE:
             kind = "where"
-        if words[0] in _WHERE + ("what", "which") and _use_at(words, length)[0]:
+        if words[0] in (*_WHERE, "what", "which") and _use_at(words, length)[0]:
             return "which", words[length:]
         words = words[length:]
         words = words[1:] if words and words[0] in ("me", "the", "is", "are") and len(words) > 1 else words
@@ -339,8 +340,10 @@ class _Reader:
 
     def question(self) -> tuple[tuple[Phrase, ...], bool]:
         """Return the phrases that answer, and whether all of them are asked for."""
-        if len(self._tokens) > 1 and self._tokens[-1].kind == "relation" and self._tokens[-1].value not in ("at", "near"):
-            return (self._inverted(),), False
+        if len(self._tokens) > 1 and self._tokens[-1].kind == "relation":
+            if self._tokens[-1].value in ("on", "in", "under", "above", "next to", "left of", "behind"):
+                return (self._inverted(),), False
+            self._tokens.pop()
         heads, every = [self._phrase()], True
         while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
             every &= self._take().kind == "and"
@@ -391,12 +394,12 @@ class _Reader:
 
     def _relation(self, token: _Token, head: Phrase, *, negated: bool = False) -> list[Clause]:
         predicates = tuple(_table()["predicates"][token.value])
-        first = self._phrase(several=False)
+        first = self._phrase()
         other = None
         if token.value == "between":
             if self._next() == "and":
                 self._take()
-                other = self._phrase(several=False)
+                other = self._phrase()
             elif first.generic:
                 return []
         if first.generic and first.order is None and (first.text in _table()["places"].split() or not first.text):
@@ -415,7 +418,7 @@ class _Reader:
             return self._relation(self._take(), head, negated=True)
         out = []
         while True:
-            phrase = self._phrase(several=False)
+            phrase = self._phrase()
             if self._next() == "relation":
                 phrase = replace(phrase, where=tuple(self._relation(self._take(), phrase)))
             if not phrase.generic or phrase.where or phrase.order:
@@ -424,57 +427,58 @@ class _Reader:
                 return out
             self._take()
 
-    def _phrase(self, *, several: bool = True) -> Phrase:
-        """Return attributes, noun, order and use up to a clause or a join."""
-        words: list[str] = []
-        noun: _Token | None = None
-        out, text, generic = Phrase(""), [], False
-        rank: int | None = None
-        while (kind := self._next()) and kind not in ("and", "or", "not", "relation"):
+    def _phrase(self) -> Phrase:
+        """Return what stands up to a clause or a join."""
+        tokens: list[_Token] = []
+        while self._next() not in ("", "and", "or", "not", "relation"):
             token = self._take()
-            text.append(token.text)
-            if kind == "noun":
-                words += _name(noun) if noun is not None else ()
-                noun = token
-            elif kind == "word":
-                words.append(token.value)
-            elif kind == "thing":
-                generic = token.text in ("thing", "one", "object", "item", "piece")
-            elif kind == "size":
-                out = replace(out, size=token.value)
-            elif kind == "number":
-                out = replace(out, instance_id=token.value)
-            elif kind == "change":
-                out = replace(out, change=token.value)
-            elif kind == "use":
-                out = replace(out, use=token.text, meant=token.value)
-            elif kind == "rank":
-                rank = token.value
-                out = replace(out, order=replace(out.order, rank=rank)) if out.order else out
-            elif kind == "order" and several | (token.value not in ("higher",)):
-                out = replace(out, order=self._order(token, rank))
-                if out.order and out.order.to is not None:
-                    break
-        if noun is not None and generic and not words:
-            words, noun = [*words, *_name(noun)], None  # the orange one
-        if noun is not None and out.use is None:
-            out = replace(out, noun=_name(noun), meant=noun.value)
-        elif noun is not None:
-            words += _name(noun)
-        places = _table()["places"].split()
-        kept = [w for w in dict.fromkeys(words) if w not in places]
-        if len(kept) < len(words) and not (kept or out.noun or out.use or out.order) and out.instance_id is None:
-            return replace(out, text=words[0])
-        return replace(out, text=" ".join(text) or "", words=tuple(kept))
+            if token.value in ("nearest", "farthest"):
+                token = _Token("order", token.text, Order(token.value, to=self._measured_from()))
+            elif token.kind == "order":
+                token = _Token("order", token.text, Order(token.value))
+            tokens.append(token)
+        return _phrase_of(tokens)
 
-    def _order(self, token: _Token, rank: int | None) -> Order:
-        to = None
-        if token.value in ("nearest", "farthest") and self._next() in ("noun", "word", "number", "size", "order", "rank"):
-            to = self._phrase(several=False)
-        elif token.value in ("nearest", "farthest") and self._next() == "relation":
-            self._at += self._tokens[self._at].value in ("near", "at")
-            to = self._phrase(several=False)
-        return Order(token.value, rank or 1, to)
+    def _measured_from(self) -> Phrase | None:
+        """Return what "closest to" or "farthest from" is measured from; None where that is not said."""
+        if self._next() == "relation" and self._tokens[self._at].value in ("near", "at"):
+            self._take()
+        return self._phrase() if self._next() in ("noun", "word", "number", "size", "order", "rank") else None
+
+
+def _phrase_of(tokens: list[_Token]) -> Phrase:
+    """Return the phrase of attributes, nouns of which the last names it, and what else was said of it."""
+    last = {t.kind: t for t in tokens}
+    noun = None if "use" in last else last.get("noun")
+    if noun is not None and "thing" in last and last["thing"].text in ("thing", "one", "object", "item"):
+        noun = noun if "word" in last else None  # the orange one
+    words = [
+        w
+        for t in tokens
+        if t is not noun
+        for w in (_name(t) if t.kind == "noun" else [t.value])
+        if t.kind in ("noun", "word")
+    ]
+    order = last["order"].value if "order" in last else None
+    if order is not None and "rank" in last:
+        order = replace(order, rank=last["rank"].value)
+    named = last.get("use", noun)
+    text = " ".join(t.text for t in tokens)
+    places = _table()["places"].split()
+    if words and set(words) <= set(places) and {t.kind for t in tokens} == {"word"}:
+        return Phrase(words[0])
+    return Phrase(
+        text,
+        tuple(w for w in dict.fromkeys(words) if w not in places),
+        () if noun is None else _name(noun),
+        () if named is None else named.value,
+        last["use"].text if "use" in last else None,
+        last["size"].value if "size" in last else None,
+        order,
+        last["number"].value if "number" in last else None,
+        (),
+        last["change"].value if "change" in last else None,
+    )
 
 
 def _name(token: _Token) -> tuple[str, ...]:

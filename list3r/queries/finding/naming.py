@@ -42,7 +42,9 @@ def why_named(phrase: Phrase, i: Instance, *, kind: bool) -> str:
     said = " ".join(phrase.all_words)
     if not phrase.meant or set(phrase.noun) <= set(split_words(f"{called} {i.description}")):
         return f"named {said}"
-    return f"{called}: a kind of {phrase.meant[0]}" if kind else f"named {called}, another word for {' '.join(phrase.noun)}"
+    if kind:
+        return f"{called}: a kind of {phrase.meant[0]}"
+    return f"named {called}, another word for {' '.join(phrase.noun)}"
 
 
 def _spoken(use: str) -> list[str]:

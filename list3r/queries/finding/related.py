@@ -60,6 +60,8 @@ class PhraseSearch:
     """What of a large memory is in `things`; None where it is everything."""
     notes: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    mentioned: dict[int, float] = field(default_factory=dict)
+    """Instances that any part of the question names, with how well."""
     undecided: bool = False
     """Whether the memory cannot know a relation that was asked for."""
     by_look: bool = False
