@@ -10,6 +10,8 @@ from list3r.memory.store.store import Store
 from list3r.queries.find import meant
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
 from list3r.queries.finding.grammar import Phrase, parse
+from list3r.queries.finding.naming import looser
+from list3r.queries.finding.related import PhraseMatch
 from list3r.queries.finding.words import STRUCTURE, no_such_words, wanted_words, word_score
 from list3r.queries.match import Filters
 from list3r.queries.views.gather import is_large, sample
@@ -32,14 +34,24 @@ def named_by(
     if (phrase := _more_than_names(words)) is not None:
         found, search = meant(store, phrase, encoder=encoder)
         notes += search.notes
-        return [(c.instance, c.score, "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
+        return _passing(found, filters)
+    phrase = parse(words).phrases[0]
+    if not is_large(store) and (named := _passing(meant(store, phrase)[0], filters)):
+        return named
     others = [i for i in _with_words(store, words, filters, notes) if origin is None or i.id != origin.id]
-    named = _named(others, words)
+    named = _named(others, words) or _passing(meant(store, phrase)[0], filters)
+    for looser_phrase, share, why in looser(phrase) if not named and encoder is None else ():
+        found = [PhraseMatch(c.instance, c.score * share, (*c.reasons, why)) for c in meant(store, looser_phrase)[0]]
+        named = named or _passing(found, filters)
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
     if not named and (unknown := [w for w in wanted_words(words) if w not in store.words.known([w])]):
         notes.append(no_such_words(unknown, sample(store)))
     return named
+
+
+def _passing(found: Sequence[PhraseMatch], filters: Filters) -> list[tuple[Instance, float, str]]:
+    return [(c.instance, round(c.score, 4), "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
 
 
 def _more_than_names(words: str) -> Phrase | None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.description.words import kind_word, vocabulary
+from list3r.memory.description.words import adjectives, kind_word, vocabulary
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
@@ -111,17 +111,25 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
     best: dict[int, PhraseMatch] = {}
     fits: list[bool] = []
     undecided = by_look = False
+    order = question.phrases[0].order if all(p.order is None for p in question.phrases[1:]) else None
+    shared = order if len(question.phrases) > 1 else None
     for phrase in question.phrases:
-        found, search = meant(store, phrase, viewpoint, encoder)
+        asked = replace(phrase, order=None) if shared else phrase
+        found, search = meant(store, asked, viewpoint, encoder)
         fits.append(len(found) >= question.at_least and not search.by_look)
-        undecided, by_look = undecided or search.undecided, by_look or search.by_look
+        strange = phrase.meant and any(w in search.unknown and w not in adjectives() for w in phrase.words)
+        undecided, by_look = undecided or search.undecided or bool(strange), by_look or search.by_look
         notes += search.notes
         unknown += search.unknown
         mentioned |= search.mentioned
         for c in found:
             if c.instance.id not in best or best[c.instance.id].score < c.score:
                 best[c.instance.id] = c
+    if shared is not None and best:  # which is larger, the sofa or the armchair
+        best = {c.instance.id: c for c in ordered(search, list(best.values()), shared, [])}
     exact = bool(best) and not by_look
+    if not any(_says_something(p) for p in question.phrases) and question.kind == "which":
+        return Found((), ["say what to look for, such as: white mug on table"])
     if not best:
         best = _nearest_by_meaning(store, question, encoder)
     ranked = sorted(best.values(), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
@@ -138,6 +146,10 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
     if not exact and ranked:
         out.notes = (*out.notes, "nothing fits; these are the nearest by " + ("look" if by_look else "meaning"))
     return out
+
+
+def _says_something(phrase: Phrase) -> bool:
+    return phrase != Phrase("anything")
 
 
 def _reason(c: PhraseMatch) -> str:
@@ -311,7 +323,9 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
         if kept or out:
             search.mentioned |= {c.instance.id: c.score for c in kept or out}
             return kept or out
-    if len(phrase.all_words) > 1:
+    if phrase.use is not None:
+        search.notes.append(f"no instance is known to be for this: {phrase.use}")
+    elif len(phrase.all_words) > 1:
         said = ", ".join(repr(w) for w in phrase.all_words)
         search.notes.append(f"no instance matches all of the words {said}")
     return []

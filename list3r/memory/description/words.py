@@ -20,6 +20,12 @@ def _same() -> dict[str, str]:
     return {word: one for group in table.values() for one, many in group.items() for word in many.split()}
 
 
+@cache
+def adjectives() -> frozenset[str]:
+    """Return the words of colour, size and shape that descriptions use: of what none has, it is known."""
+    return frozenset(_same().values()) | {"light", "dark", "orange", "beige", "tan", "medium", "box", "bar", "slab"}
+
+
 def vocabulary(label: str | None, structure: str | None, description: str, color_name: str) -> dict[str, float]:
     """Return the words that an instance has, singular and in one word for many, with how well each names it, in (0,
     1].

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import re
+import string
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -95,6 +96,8 @@ class Clause:
     other: Phrase | None = None
     """The second of two, for between."""
     negated: bool = False
+    either: bool = False
+    """Whether it holds or the one before it."""
 
 
 @dataclass(frozen=True)
@@ -182,28 +185,43 @@ def _apart(run: str) -> list[str]:
 
 
 def parse(text: str) -> Question:
-    """Read a question. Raises `OptionError` for a text without a letter or a digit; anything else is a question."""
+    """Read a question. Raises `OptionError` for a text of spaces and punctuation; anything else is a question."""
     words = _words(text)
-    if not re.search(r"[^\W_]", text):
+    if not text.strip(string.punctuation + string.whitespace):
         raise OptionError(f"{text!r} has no word to search for; ask for something such as: white mug on table")
     notes = []
     if len(words) > _MOST_WORDS:
         notes.append(f"the question has {len(words)} words; the first {_MOST_WORDS} were read")
         words = words[:_MOST_WORDS]
     words, place = _split_off(words, _openings("seen_from"))
-    kind, words = _kind(words)
+    kind, words = _kind(_with_its_end(words))
     at_least = 1
     if kind == "exists" and words:
         more, words = ("more" in words[:1]), [w for w in words if w not in ("more", "than")]
         number = _table()["numbers"].get(words[0], words[0]) if words else ""
         if str(number).isdigit() and len(words) > 1:
             at_least, words = int(number) + more, words[1:]
-    reader = _Reader(_tokens(words))
+    reader = _Reader(_tokens(words) or ([_Token("word", text, text)] if not _words(text) else []))
     phrases, every = reader.question()
     seen_from = _Reader(_tokens(place)).question()[0][0] if place else None
     if reader.places:
         notes.append(f"rooms are not told apart: {reader.places[0]!r} was left out")
     return Question(text, kind, phrases, every, at_least, seen_from, tuple(notes))
+
+
+def _with_its_end(words: list[str]) -> list[str]:
+    """Return words in which "closest" and "farthest" stand before what they are measured from: "seat closest to"."""
+    for k, word in enumerate(words):
+        joined = {"nearest": "to", "closest": "to", "farthest": "from", "furthest": "from"}.get(word)
+        following = words[k + 1 : k + 2]
+        if joined is None or not following or following[0] in ("to", "from", "away"):
+            continue
+        if following[0] in _table()["articles"].split():
+            return [*words[: k + 1], joined, *words[k + 1 :]]
+        end = next((n for n in range(k + 2, len(words)) if words[n] in ("to", "from")), None)
+        if end is not None:
+            return [*words[:k], *words[k + 1 : end], word, joined, *words[end + 1 :]]
+    return words
 
 
 def _split_off(words: list[str], marks: frozenset[tuple[str, ...]]) -> tuple[list[str], list[str]]:
@@ -217,16 +235,16 @@ def _split_off(words: list[str], marks: frozenset[tuple[str, ...]]) -> tuple[lis
 
 def _kind(words: list[str]) -> tuple[str, list[str]]:
     """Return what kind of question begins so, and the words after its opening."""
-    kind, asks = "which", {"counts": "count", "yes_no": "exists", "openers": ""}
+    kind, asked, asks = "which", False, {"counts": "count", "yes_no": "exists", "openers": ""}
     while words:
         length, name = max((_opening(words, _openings(n)), n) for n in asks)
-        if not length or (asks[name] and kind == "where"):
+        if not length or (asks[name] and asked):
             break
         if asks[name]:
             return asks[name], words[length:]
-        if words[0] in _WHERE:
-            kind = "where"
-        if words[0] in (*_WHERE, "what", "which") and _use_at(words, length)[0]:
+        asked = asked or words[0] in (*_WHERE, "what", "which")
+        kind = "where" if words[0] in _WHERE else kind
+        if asked and _use_at(words, length)[0]:
             return "which", words[length:]
         words = words[length:]
         words = words[1:] if words and words[0] in ("me", "the", "is", "are") and len(words) > 1 else words
@@ -242,11 +260,19 @@ def _opening(words: list[str], openings: frozenset[tuple[str, ...]]) -> int:
 
 def _tokens(words: list[str]) -> list[_Token]:
     out: list[_Token] = []
+    articles = _table()["articles"].split()
     k = 0
     while k < len(words):
         length, token = _token_at(words, k)
         if token.kind != "filler":
             out.append(token)
+        elif words[k] in ("have", "has") and k + 1 < len(words) and any(t.kind == "noun" for t in out):
+            out.append(_Token("relation", words[k], "with"))
+        elif words[k] in articles and out and out[-1].kind in ("noun", "word"):
+            since = next((n for n in range(len(out), 0, -1) if out[n - 1].kind == "noun"), 0)
+            if since and all(t.kind == "word" for t in out[since:]):
+                # Another thing begins, and how it stands to the first was not understood: the chair facing the desk.
+                out[since:] = [_Token("relation", " ".join(t.text for t in out[since:]) or "near", "near")]
         k += length
     return out
 
@@ -282,7 +308,7 @@ def _meant(part: tuple[str, ...]) -> tuple[str, ...]:
     found = (*table.get(part, ()), *table.get(tuple(split_words(" ".join(part))), ()))
     if not found and len(part) == 1 and len(part[0]) > 4 and split_words(part[0]) == [part[0]]:
         plain = unaccented(part[0])
-        ends = (plain, *(plain.removesuffix(e) for e in ("e", "er", "en", "n") if part[0] != plain or e in ("en", "n")))
+        ends = (plain, *(plain.removesuffix(e) for e in ("e", "er", "en", "n")), *(plain[:-1] + e for e in "aoe"))
         found = next((table[(w,)] for w in ends if (w,) in table), ())
     return tuple(dict.fromkeys(found))
 
@@ -309,10 +335,11 @@ def _use_at(words: list[str], k: int) -> tuple[int, tuple[str, ...]]:
     if not start or not rest:
         return 0, ()
     uses = _uses()
-    for n in range(min(_LONGEST, len(rest)), 0, -1):
+    ends = [n for n in range(1, len(rest) + 1) if n == len(rest) or _kind_of(rest[n]) in _ENDS]
+    for n in (n for n in reversed(ends) if n <= _LONGEST):
         if found := uses.get(_content(rest[:n])):
             return start + n, found
-    end = next((n for n in range(1, len(rest)) if _phrases().get((rest[n],), _Token("", "")).kind in _ENDS), len(rest))
+    end = ends[0]
     said = _content(rest[:end])
     verb = said[0] if said else ""
     if words[k] == "for":
@@ -321,6 +348,10 @@ def _use_at(words: list[str], k: int) -> tuple[int, tuple[str, ...]]:
     most = max(alike.values(), default=0)
     best = [n for use, shared in alike.items() if shared == most for n in uses[use]]
     return (start + end, tuple(dict.fromkeys(best))) if best else (0, ())
+
+
+def _kind_of(word: str) -> str:
+    return _phrases()[(word,)].kind if (word,) in _phrases() else ""
 
 
 _ENDS = ("relation", "and", "or", "not", "order")
@@ -341,14 +372,19 @@ class _Reader:
     def question(self) -> tuple[tuple[Phrase, ...], bool]:
         """Return the phrases that answer, and whether all of them are asked for."""
         if len(self._tokens) > 1 and self._tokens[-1].kind == "relation":
-            if self._tokens[-1].value in ("on", "in", "under", "above", "next to", "left of", "behind"):
+            if any(t.kind == "noun" for t in self._tokens) and self._tokens[-1].value in ("on", "in", "under", "above", "next to", "left of", "behind"):
                 return (self._inverted(),), False
             self._tokens.pop()
         heads, every = [self._phrase()], True
         while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
             every &= self._take().kind == "and"
             heads.append(self._phrase())
+        heads = _completed(heads, every=every)
         clauses = self._clauses(heads[0])
+        if heads[0].text == "anything" and len(clauses) == 1 and not clauses[0].predicates and clauses[0].object.noun:
+            unlike = clauses[0].object  # non-red cushion
+            heads = [replace(unlike, words=())]
+            clauses = (replace(clauses[0], object=Phrase(" ".join(unlike.words), unlike.words)),)
         while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
             self._take()  # mug on the table or bowl on the desk
             heads[-1] = replace(heads[-1], where=(*heads[-1].where, *clauses))
@@ -357,7 +393,7 @@ class _Reader:
             heads[-1], clauses = replace(heads[-1], where=clauses), ()
         if clauses:
             heads = [replace(h, where=(*h.where, *clauses)) for h in heads]
-        return tuple(heads), every and len(heads) > 1
+        return tuple(p for h in heads for p in _alternatives(h)), every and len(heads) > 1
 
     def _inverted(self) -> Phrase:
         """Return what something else stands to as is said last: "what is the cat lying on"."""
@@ -384,13 +420,22 @@ class _Reader:
             if token.kind == "not":
                 out += self._negation(head)
             elif token.kind == "relation":
-                out += self._relation(token, head)
+                either = self._at > 1 and self._tokens[self._at - 2].kind == "or" and bool(out)
+                out += [replace(c, either=either) for c in self._relation(token, head)]
+                while token.value in ("with", "supporting", "containing") and self._next() == "and" and not self._joins():
+                    self._take()
+                    out += self._relation(token, head)
             elif token.kind not in ("and", "or"):
                 self._at -= 1
                 more = self._phrase()  # a word that stands after a clause: the lamp on the desk there
                 if self._at < len(self._tokens) and more.generic and more.order is None:
                     self._at += 1
         return tuple(out)
+
+    def _joins(self) -> bool:
+        """Whether what follows an "and" stands for itself: it has a relation of its own."""
+        following = (t.kind for t in self._tokens[self._at + 1 :])
+        return next((k == "relation" for k in following if k in _ENDS), False)
 
     def _relation(self, token: _Token, head: Phrase, *, negated: bool = False) -> list[Clause]:
         predicates = tuple(_table()["predicates"][token.value])
@@ -402,8 +447,8 @@ class _Reader:
                 other = self._phrase()
             elif first.generic:
                 return []
-        if first.generic and first.order is None and (first.text in _table()["places"].split() or not first.text):
-            if first.text:
+        if first.generic and first.order is None and first.text in (*_table()["places"].split(), "anything"):
+            if first.text != "anything":
                 self.places.append(first.text)
             return []
         if first.ellipsis:
@@ -433,7 +478,8 @@ class _Reader:
         while self._next() not in ("", "and", "or", "not", "relation"):
             token = self._take()
             if token.value in ("nearest", "farthest"):
-                token = _Token("order", token.text, Order(token.value, to=self._measured_from()))
+                to = self._measured_from() if token.text.endswith((" to", " from")) else None
+                token = _Token("order", token.text, Order(token.value, to=to))
             elif token.kind == "order":
                 token = _Token("order", token.text, Order(token.value))
             tokens.append(token)
@@ -441,9 +487,26 @@ class _Reader:
 
     def _measured_from(self) -> Phrase | None:
         """Return what "closest to" or "farthest from" is measured from; None where that is not said."""
-        if self._next() == "relation" and self._tokens[self._at].value in ("near", "at"):
-            self._take()
         return self._phrase() if self._next() in ("noun", "word", "number", "size", "order", "rank") else None
+
+
+def _alternatives(phrase: Phrase) -> list[Phrase]:
+    """Return a phrase for each of the clauses that "or" joins: "on the desk or on the table"."""
+    groups: list[list[Clause]] = [[]]
+    for clause in phrase.where:
+        groups = [*groups, [*groups[-1][:-1], clause]] if clause.either else [*groups[:-1], [*groups[-1], clause]]
+    return [replace(phrase, where=tuple(g)) for g in groups]
+
+
+def _completed(heads: list[Phrase], *, every: bool) -> list[Phrase]:
+    """Return phrases with the noun that the last has: "blue or red cushions" are two, "a red and white cup" is one."""
+    last = heads[-1]
+    bare = [h for h in heads[:-1] if h.words and not (h.noun or h.use or h.order)]
+    if not bare or len(bare) < len(heads) - 1 or not last.noun:
+        return heads
+    if every:
+        return [replace(last, words=(*(w for h in bare for w in h.words), *last.words))]
+    return [*(replace(last, text=f"{h.text} {' '.join(last.noun)}", words=h.words) for h in bare), last]
 
 
 def _phrase_of(tokens: list[_Token]) -> Phrase:
@@ -468,7 +531,7 @@ def _phrase_of(tokens: list[_Token]) -> Phrase:
     if words and set(words) <= set(places) and {t.kind for t in tokens} == {"word"}:
         return Phrase(words[0])
     return Phrase(
-        text,
+        text or "anything",
         tuple(w for w in dict.fromkeys(words) if w not in places),
         () if noun is None else _name(noun),
         () if named is None else named.value,

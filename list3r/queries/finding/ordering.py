@@ -75,12 +75,14 @@ def _chosen(ranked: list[tuple[PhraseMatch, str]], rank: int) -> list[PhraseMatc
 def _by_distance(
     search: PhraseSearch, found: list[PhraseMatch], order: Order, to: Sequence[PhraseMatch]
 ) -> list[PhraseMatch]:
-    if order.to is not None and not to:
+    if order.to is not None and not to and not order.to.generic:
         return []
-    if not to:
+    if not to or (order.to is not None and order.to.generic):
         search.notes.append(f"{order.by} to what? name it, such as: chair closest to the door")
         return found
     ends = {c.instance.id for c in to}
+    holding = search.store.relations.among(ends, ("on", "in", "attached_to"), as_object=False)
+    ends |= {r.object for r in holding}
     own = [c for c in found if c.instance.id not in ends] or found
     away = np.array([min(float(np.linalg.norm(c.instance.center - o.instance.center)) for o in to) for c in own])
     sign = 1 if order.by == "nearest" else -1

@@ -24,7 +24,7 @@ _MOST_OBJECTS = 40
 """Instances that others may be left of, or between: at most this many are considered."""
 _FAR = 1000.0
 """Metres from which things are seen as on a plan."""
-_ON_PLAN = "as on a plan, x to the right"
+_ON_PLAN = "far away, as on a plan with x to the right"
 _FADES = 0.1
 """Per metre: of two things to the left of another the nearer one is meant."""
 _FURTHER = "near"
@@ -82,7 +82,8 @@ def related(
     `text` is the phrase that `found` match, for notes, of which there are none where `silent`.
     """
     objects, others = (_few(search, end, clause) for end in ends)
-    if clause.other:
+    if clause.predicates == ("between",):
+        others = others if clause.other else objects
         out = _between(search, found, objects, others)
     else:
         out = _standing(search, found, objects, clause.predicates)
@@ -200,7 +201,7 @@ def viewpoint_of(search: PhraseSearch, o: Instance) -> Place:
             return camera_of_frame(search.store, o.best_view.frame_index, o.best_view.session_id)
         except OptionError:
             pass
-    search.notes.append(f"no viewpoint was given: left and right are {_ON_PLAN}; --from names another")
+    search.notes.append(f"no viewpoint was given: left and right are as seen from {_ON_PLAN}; --from names another")
     x, y, z = o.center.tolist()
     return (x, y - _FAR * unit_of(search.store), z)
 
@@ -216,7 +217,9 @@ def viewer_of(search: PhraseSearch, o: Instance) -> Viewpoint | None:
 
 def _seen_from(search: PhraseSearch, reason: str) -> str:
     """Name the assumed viewpoint by what it is."""
-    return _ON_PLAN if search.viewpoint is None and "the point" in reason else reason
+    if search.viewpoint is not None or "the point" not in reason:
+        return reason
+    return reason[: reason.index("the point")] + _ON_PLAN
 
 
 def _between(
