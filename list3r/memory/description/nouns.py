@@ -14,6 +14,7 @@ from pathlib import Path
 
 from list3r.memory.description.words import split_words
 
+_COLLECTIVE = frozenset("pile stack row pair set bunch group piece pieces pairs lot collection".split())
 LANGUAGES = ("de", "fr", "es", "it", "ja", "zh")
 """Of the names beside the English ones."""
 
@@ -92,13 +93,13 @@ def unaccented(text: str) -> str:
 def nouns_of(text: str) -> tuple[str, ...]:
     """Return the nouns that a text ends in, the longest first, each a kind of the next: what an "old office chair" is.
 
-    Empty where it ends in none. Of "chest of drawers" and "pile of books" all is one name, or what stands before "of".
+    Empty where it ends in none. Of "box of cereal" what stands before "of" counts, of "pile of books" what stands after.
     """
     raw, table = re.findall(r"[^\W_]+", text.lower()), names()
-    if (whole := table.get(tuple(raw))) or "of" not in raw[1:-1]:
-        words = raw
-    else:
-        words = raw[: raw.index("of")]
+    whole, words = table.get(tuple(raw)), raw
+    if not whole and "of" in raw[1:-1]:
+        head, counted = raw[: raw.index("of")], raw[raw.index("of") + 1 :]
+        words = counted if head[-1] in _COLLECTIVE else head
     out: list[str] = list((whole or ())[:1])
     for start in range(len(words)):
         end = tuple(words[start:])
