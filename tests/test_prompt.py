@@ -117,7 +117,8 @@ def test_a_question_brings_what_it_names_to_the_front(many: SceneMemory) -> None
     by_id = many.prompt(300, "what is beside #157?").listed
     assert by_id[0] == 157 and set(by_id[1:5]) <= {156, 158, 137, 177}
     unknown = many.prompt(200, "zebras")
-    assert unknown.listed == many.prompt(200).listed[: len(unknown.listed)] and "no thing is known as 'zebra'" in unknown.text
+    assert unknown.listed == many.prompt(200).listed[: len(unknown.listed)]
+    assert "no thing is known as 'zebra'" in unknown.text
     assert "no thing is known" not in many.prompt(200, "which lamp is the nearest?").text
 
 

@@ -187,8 +187,9 @@ def test_a_prompt_says_what_of_its_question_is_not_known(room: Room) -> None:
 
 
 WORDS = (
-    "the a is there how many where what not and or between on in left of from closest to second largest without something "
-    "to sit on mug cup couch Stuhl chaise 椅子 red blue one 3 #2 99 seen from with it room more than two first last has"
+    "the a is there how many where what not and or between on in left of from closest to second largest without "
+    "something to sit on mug cup couch Stuhl chaise 椅子 red blue one 3 #2 99 seen from with it room more than two "
+    "first last has"
 ).split(" ")
 TEXTS = st.one_of(st.text(max_size=60), st.lists(st.sampled_from(WORDS), min_size=1, max_size=12).map(" ".join))
 

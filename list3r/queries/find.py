@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from list3r.memory.description.words import adjectives, kind_word, vocabulary
 from list3r.memory.errors import OptionError, UnknownIdError
@@ -214,12 +215,15 @@ def _by_words_alone(store: Store, question: Question, k: int) -> Found | None:
     return Found(matches, (*gathered.notes, *notes), (), len(ranks.ids))
 
 
-def _of_other_names(gathered: Gathered, phrase: Phrase, ids: np.ndarray) -> np.ndarray:
+def _of_other_names(gathered: Gathered, phrase: Phrase, ids: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the hundredths by which those are worse that are named by another word of the same meaning."""
-    by_name = set(gathered.bearing((*phrase.noun, kind_word(phrase.meant[0]))))
-    weight = dict(zip(*(a.tolist() for a in gathered.named((kind_word(phrase.meant[0]),))), strict=True))
-    most = round(100 * SYNONYM)
-    return np.array([0 if n in by_name else max(0, weight.get(n, 0) - most) for n in ids.tolist()])
+    key = kind_word(phrase.meant[0])
+    by_name, (known, weight) = gathered.bearers((*phrase.noun, key))[0], gathered.bearers((key,))
+    if len(by_name) == len(known):
+        return np.zeros(len(ids), np.int64)
+    order = np.argsort(known)
+    named = weight[order][np.searchsorted(known[order], ids)].astype(np.int64)
+    return np.where(np.isin(ids, by_name), 0, np.maximum(0, named - round(100 * SYNONYM)))
 
 
 # ---------------------------------------------------------------------------------------------- phrases

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -61,27 +60,33 @@ def _parts(text: str, separator: str = ",") -> tuple[str, ...]:
 
 @cache
 def names() -> dict[tuple[str, ...], tuple[str, ...]]:
-    """Return the nouns that words mean, by the words: as they stand in lower case and as `split_words` has them."""
+    """Return the nouns that words mean, by the words in lower case, the English ones as `split_words` has them too.
+
+    A foreign name that is an English one as well ("table") means the English one.
+    """
     out: dict[tuple[str, ...], list[str]] = {}
 
-    def add(texts: Iterable[str], name: str, *, new: bool) -> None:
-        for text in texts:
-            for words in {tuple(split_words(text)), tuple(re.findall(r"[^\W_]+", text.lower()))}:
-                held = out.setdefault(words, [])
-                if name not in held and (not held or not new):
-                    held.append(name)
+    def add(words: tuple[str, ...], name: str) -> None:
+        if name not in out.setdefault(words, []):
+            out[words].append(name)
 
     nouns = all_nouns().values()
     for n in nouns:
-        add([n.name], n.name, new=False)
-    for n in nouns:
-        add(n.synonyms, n.name, new=True)
-    english = set(out)
-    for n in nouns:
-        foreign = [t for texts in n.foreign.values() for t in texts]
-        add([t for t in foreign if tuple(split_words(t)) not in english], n.name, new=False)
-        add([plain for t in foreign if (plain := unaccented(t)) != t and (plain,) not in out], n.name, new=False)
+        add(raw_words(n.name), n.name)
+        add(tuple(split_words(n.name)), n.name)
+    for noun, text in ((n, text) for n in nouns for text in n.synonyms):
+        for words in {raw_words(text), tuple(split_words(text))} - out.keys():
+            add(words, noun.name)
+    english = frozenset(out)
+    for noun, text in ((n, text) for n in nouns for texts in n.foreign.values() for text in texts):
+        for words in {raw_words(text), raw_words(text if text.isascii() else unaccented(text))} - english:
+            add(words, noun.name)
     return {words: tuple(held) for words, held in out.items()}
+
+
+def raw_words(text: str) -> tuple[str, ...]:
+    """Return the words of a text as they stand, in lower case."""
+    return tuple(re.findall(r"[^\W_]+", text.lower()))
 
 
 def unaccented(text: str) -> str:
@@ -93,9 +98,9 @@ def unaccented(text: str) -> str:
 def nouns_of(text: str) -> tuple[str, ...]:
     """Return the nouns that a text ends in, the longest first, each a kind of the next: what an "old office chair" is.
 
-    Empty where it ends in none. Of "box of cereal" what stands before "of" counts, of "pile of books" what stands after.
+    Empty where it ends in none. Of "box of cereal" what stands before "of" counts, of "pile of books" the rest.
     """
-    raw, table = re.findall(r"[^\W_]+", text.lower()), names()
+    raw, table = list(raw_words(text)), names()
     whole, words = table.get(tuple(raw)), raw
     if not whole and "of" in raw[1:-1]:
         head, counted = raw[: raw.index("of")], raw[raw.index("of") + 1 :]

@@ -28,6 +28,16 @@ from list3r.memory.errors import OptionError
 
 _BOUNDS = {"floor", "wall", "ceiling"}
 """What bounds a room: what is said after one is seldom said of it."""
+_INVERSE = {
+    "on": ("supports",),
+    "in": ("contains",),
+    "under": ("above",),
+    "above": ("under", "below"),
+    "next to": ("next_to", "near"),
+}
+"""What a thing is to which another stands so: of "what is the cat lying on?"."""
+_SEVERAL = ("with", "supporting", "containing")
+"""Relations to all of several: "the desk with the laptop and the monitor"."""
 _MOST_WORDS = 64
 _LONGEST = 7
 """Words of the longest phrase."""
@@ -372,7 +382,7 @@ class _Reader:
     def question(self) -> tuple[tuple[Phrase, ...], bool]:
         """Return the phrases that answer, and whether all of them are asked for."""
         if len(self._tokens) > 1 and self._tokens[-1].kind == "relation":
-            if any(t.kind == "noun" for t in self._tokens) and self._tokens[-1].value in ("on", "in", "under", "above", "next to", "left of", "behind"):
+            if any(t.kind == "noun" for t in self._tokens) and self._tokens[-1].value in _INVERSE:
                 return (self._inverted(),), False
             self._tokens.pop()
         heads, every = [self._phrase()], True
@@ -400,8 +410,7 @@ class _Reader:
         relation = self._tokens.pop()
         things = [t for t in self._tokens if t.kind != "thing"]
         subject = _Reader(things or self._tokens).question()[0][0]
-        inverse = {"on": ("supports",), "in": ("contains",), "under": ("above",), "above": ("under", "below")}
-        predicates = inverse.get(relation.value) or tuple(_table()["predicates"][relation.value])
+        predicates = _INVERSE[relation.value]
         return Phrase("anything", where=(Clause(f"with something {relation.text}", predicates, subject),))
 
     def _next(self, ahead: int = 0) -> str:
@@ -422,7 +431,7 @@ class _Reader:
             elif token.kind == "relation":
                 either = self._at > 1 and self._tokens[self._at - 2].kind == "or" and bool(out)
                 out += [replace(c, either=either) for c in self._relation(token, head)]
-                while token.value in ("with", "supporting", "containing") and self._next() == "and" and not self._joins():
+                while token.value in _SEVERAL and self._next() == "and" and not self._joins():
                     self._take()
                     out += self._relation(token, head)
             elif token.kind not in ("and", "or"):

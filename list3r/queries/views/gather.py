@@ -55,21 +55,22 @@ class Gathered:
 
     def bearing(self, words: tuple[str, ...]) -> list[int]:
         """Return ids that have all of some words, the best first."""
-        ids: list[int] = self._named(words)[0].tolist()
+        ids: list[int] = self.bearers(words)[0].tolist()
         return ids
 
     def named(self, words: tuple[str, ...]) -> Bearers:
         """Return the instances that are looked at of those that have all of some words, the best first."""
-        ids, hundredths = self._named(words)
+        ids, hundredths = self.bearers(words)
         if len(ids) > _MOST:
-            self.notes.append(f"{len(ids)} instances match {' '.join(words)!r}; {_MOST} of them were considered")
+            self.notes.append(f"{len(ids)} instances match {_said(words)!r}; {_MOST} of them were considered")
         return ids[:_MOST], hundredths[:_MOST]
 
-    def _named(self, words: tuple[str, ...]) -> Bearers:
+    def bearers(self, words: tuple[str, ...]) -> Bearers:
+        """Return the instances that have all of some words, the best first."""
         if words not in self._bearing:
             ids, hundredths = self.store.words.bearing(words, _MOST_BEARING + 1)
             if len(ids) > _MOST_BEARING:
-                self.notes.append(f"more than {_MOST_BEARING} instances match {' '.join(words)}; add words")
+                self.notes.append(f"more than {_MOST_BEARING} instances match {_said(words)!r}; add words")
             self._bearing[words] = ids[:_MOST_BEARING], hundredths[:_MOST_BEARING]
         return self._bearing[words]
 
@@ -95,6 +96,11 @@ class Gathered:
         ids = ids[:: -(-len(ids) // _SAMPLE)] if len(ids) >= 4 else np.array(self.sample)
         ranks = self.store.instances.ranks(ids)
         return np.sort(ranks.longest_edge[~ranks.structure])
+
+
+def _said(words: tuple[str, ...]) -> str:
+    """Return words for a note, kinds of thing too."""
+    return " ".join(w.strip("_").replace("_", " ") for w in words)
 
 
 def is_large(store: Store) -> bool:
