@@ -85,6 +85,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
         ("which is larger, the mug or the sofa?", "sofa"),
         ("a lamp smaller than the cat", ""),
         ("a lamp taller than the moon", ""),
+        ("which lamp is the largest?", "floor_lamp"),
         ("Katze", "cat"),
         ("wo ist der Stuhl neben dem Schreibtisch", "office_chair"),
         ("la tasse sur la table", "mug"),
@@ -137,6 +138,12 @@ def test_counts(room: Room, question: str, count: int | None) -> None:
         ("is there a mug or a dog?", "yes"),
         ("is the mug on the desk or on the table?", "yes"),
         ("does the desk have a lamp on it?", "yes"),
+        ("are there fewer than three chairs?", "no"),
+        ("are there exactly two lamps?", "yes"),
+        ("are all chairs next to the desk?", "no"),
+        ("are all cats on the couch?", "yes"),
+        ("did I leave the mug on the table?", "yes"),
+        ("is the lamp on?", None),
         ("is the door open?", None),
         ("where is the cat?", None),
     ],
@@ -225,6 +232,7 @@ def test_what_is_read_is_a_frozen_question() -> None:
     assert question.phrases[0].where[0].predicates[0] == "next_to"
     assert parse("what is left of the mug seen from the door?").seen_from is not None
     assert parse("are there two cats?").at_least == 2
+    assert parse("things on the table which are white").phrases[0].words == ("white",)
     assert hash(question)
 
 

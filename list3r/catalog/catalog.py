@@ -195,7 +195,7 @@ class Catalog:
         total, notes, fits = 0, list(question.notes), []
         for phrase in question.phrases:
             found, ranked = self._named(memory, phrase, k, filters)
-            fits.append(ranked >= question.at_least)
+            fits.append(question.at_least <= ranked <= (MOST_RANKED if question.at_most is None else question.at_most))
             total += ranked
             if ranked >= MOST_RANKED:
                 notes.append(f"{ranked} or more things match {text!r}; only {ranked} were ranked")

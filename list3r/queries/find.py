@@ -117,7 +117,7 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
     for phrase in question.phrases:
         asked = replace(phrase, order=None) if shared else phrase
         found, search = meant(store, asked, viewpoint, encoder)
-        fits.append(len(found) >= question.at_least and not search.by_look)
+        fits.append(_fits(store, question, phrase, len(found)) and not search.by_look)
         strange = phrase.meant and any(w in search.unknown and w not in adjectives() for w in phrase.words)
         undecided, by_look = undecided or search.undecided or bool(strange), by_look or search.by_look
         notes += search.notes
@@ -147,6 +147,13 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
     if not exact and ranked:
         out.notes = (*out.notes, "nothing fits; these are the nearest by " + ("look" if by_look else "meaning"))
     return out
+
+
+def _fits(store: Store, question: Question, phrase: Phrase, count: int) -> bool:
+    """Whether so many are enough for a yes."""
+    if question.all_of and phrase.noun:
+        return count == len(meant(store, Phrase(phrase.text, (), phrase.noun, phrase.meant))[0]) > 0
+    return question.at_least <= count and (question.at_most is None or count <= question.at_most)
 
 
 def _says_something(phrase: Phrase) -> bool:
@@ -323,7 +330,7 @@ def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
             score = _score(search, n, phrase, nouns)
             if score > 0.0:
                 out.append(PhraseMatch(i, score, (why_named(phrase, i, kind=nouns != phrase.meant),)))
-        kept = [c for c in out if c.instance.structure is None or bound]
+        kept = [c for c in out if bound or not _bounds(c.instance)]
         if kept or out:
             search.mentioned |= {c.instance.id: c.score for c in kept or out}
             return kept or out

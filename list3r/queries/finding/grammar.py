@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from list3r.memory.description.nouns import all_nouns, names, unaccented
+from list3r.memory.description.nouns import all_nouns, is_a, names, unaccented
 from list3r.memory.description.words import split_words
 from list3r.memory.errors import OptionError
 
@@ -36,7 +36,7 @@ _INVERSE = {
     "next to": ("next_to", "near"),
 }
 """What a thing is to which another stands so: of "what is the cat lying on?"."""
-_SEVERAL = ("with", "supporting", "containing")
+_SEVERAL = ("with", "supporting", "containing", "next to", "near")
 """Relations to all of several: "the desk with the laptop and the monitor"."""
 _MOST_WORDS = 64
 _LONGEST = 7
@@ -121,8 +121,12 @@ class Question:
     """What is asked for: what any of them means answers."""
     every: bool = False
     """Whether all of the phrases must be there for a yes."""
+    all_of: bool = False
+    """Whether a yes needs all that have the name: "are all chairs brown?"."""
     at_least: int = 1
-    """How many must be there for a yes."""
+    """How many must be there for a yes,"""
+    at_most: int | None = None
+    """and how many may be; None for any number."""
     seen_from: Phrase | None = None
     notes: tuple[str, ...] = ()
 
@@ -172,7 +176,7 @@ def _openings(name: str) -> frozenset[tuple[str, ...]]:
 def _words(text: str) -> list[str]:
     """Return words as they stand, short forms in full; what is written without spaces comes apart at known nouns."""
     text = re.sub(r"[’`]", "'", text.lower())
-    text = re.sub(r"\bcan't\b", "can not", re.sub(r"n't\b", " not", text))
+    text = re.sub(r"n't\b", " not", text.replace("can't", "can not").replace("cannot", "can not"))
     text = re.sub(r"\b(what|where|who|which|that|there|it|how|here)'s\b", r"\1 is", text).replace("i'm ", "i am ")
     text = re.sub(r"'s\b", "", text)
     text = re.sub(f"[{_ASIAN}]+", lambda found: f" {' '.join(_apart(found[0]))} ", text)
@@ -204,19 +208,41 @@ def parse(text: str) -> Question:
         notes.append(f"the question has {len(words)} words; the first {_MOST_WORDS} were read")
         words = words[:_MOST_WORDS]
     words, place = _split_off(words, _openings("seen_from"))
-    kind, words = _kind(_with_its_end(words))
-    at_least = 1
-    if kind == "exists" and words:
-        more, words = ("more" in words[:1]), [w for w in words if w not in ("more", "than")]
-        number = _table()["numbers"].get(words[0], words[0]) if words else ""
-        if str(number).isdigit() and len(words) > 1:
-            at_least, words = int(number) + more, words[1:]
-    reader = _Reader(_tokens(words) or ([_Token("word", text, text)] if not _words(text) else []))
+    kind, words = _kind(_adjectives_first(_with_its_end(words)))
+    bounds, words = _bounds_of(words) if kind == "exists" else ((1, None), words)
+    tokens = _tokens(words) or ([_Token("word", text, text)] if not _words(text) else [])
+    if kind == "exists" and len(tokens) > 1 and tokens[-1].kind == "relation":
+        tokens[-1] = _Token("word", tokens[-1].text, tokens[-1].text)  # is the lamp on
+    reader = _Reader(tokens)
     phrases, every = reader.question()
     seen_from = _Reader(_tokens(place)).question()[0][0] if place else None
     if reader.places:
         notes.append(f"rooms are not told apart: {reader.places[0]!r} was left out")
-    return Question(text, kind, phrases, every, at_least, seen_from, tuple(notes))
+    all_of = kind == "exists" and bool({"all", "every", "each", "both"} & set(words))
+    return Question(text, kind, phrases, every, all_of, *bounds, seen_from, tuple(notes))
+
+
+def _bounds_of(words: list[str]) -> tuple[tuple[int, int | None], list[str]]:
+    """Return how many there must and may be for a yes, and the words after that: "more than two plants"."""
+    said = [w for w in words[:4] if w not in ("than", "at", "exactly", "only", "just", "the")]
+    compared = said[0] if said and said[0] in ("more", "fewer", "less", "least", "most") else ""
+    number = _table()["numbers"].get(said[bool(compared)], said[bool(compared)]) if len(said) > bool(compared) else ""
+    if not str(number).isdigit() or len(words) < 2:
+        return (1, None), words
+    count, exact = int(number), "exactly" in words[:2]
+    rest = words[words.index(said[bool(compared)]) + 1 :]
+    if compared in ("fewer", "less", "most"):
+        return (0, count - (compared != "most")), rest
+    return (count + (compared == "more"), count if exact else None), rest
+
+
+def _adjectives_first(words: list[str]) -> list[str]:
+    """Return words with what is said of the first thing at the end before it: "things on the desk that are white"."""
+    for k in range(len(words) - 2, 0, -1):
+        if words[k - 1] in ("that", "which") and words[k] in ("is", "are"):
+            last = _tokens(words[k + 1 :])
+            return [*words[k + 1 :], *words[: k - 1]] if last and all(t.kind == "word" for t in last) else words
+    return words
 
 
 def _with_its_end(words: list[str]) -> list[str]:
@@ -279,7 +305,8 @@ def _tokens(words: list[str]) -> list[_Token]:
         elif words[k] in ("have", "has") and k + 1 < len(words) and any(t.kind == "noun" for t in out):
             out.append(_Token("relation", words[k], "with"))
         elif words[k] in articles and out and out[-1].kind in ("noun", "word"):
-            since = next((n for n in range(len(out), 0, -1) if out[n - 1].kind == "noun"), 0)
+            last_words = k + 1 < len(words) and _token_at(words, k + 1)[1].kind in ("order", "rank")
+            since = 0 if last_words else next((n for n in range(len(out), 0, -1) if out[n - 1].kind == "noun"), 0)
             if since and all(t.kind == "word" for t in out[since:]):
                 # Another thing begins, and how it stands to the first was not understood: the chair facing the desk.
                 out[since:] = [_Token("relation", " ".join(t.text for t in out[since:]) or "near", "near")]
@@ -382,7 +409,8 @@ class _Reader:
     def question(self) -> tuple[tuple[Phrase, ...], bool]:
         """Return the phrases that answer, and whether all of them are asked for."""
         if len(self._tokens) > 1 and self._tokens[-1].kind == "relation":
-            if any(t.kind == "noun" for t in self._tokens) and self._tokens[-1].value in _INVERSE:
+            others = [t.kind for t in self._tokens[:-1]]
+            if "noun" in others and "relation" not in others and self._tokens[-1].value in _INVERSE:
                 return (self._inverted(),), False
             self._tokens.pop()
         heads, every = [self._phrase()], True
@@ -464,6 +492,9 @@ class _Reader:
             first = replace(first, noun=head.noun, meant=head.meant)
         if not negated and self._next() == "relation" and not set(first.meant) & _BOUNDS:
             first = replace(first, where=self._clauses(first))
+        for said, kind, further in (("on", "shelf", "in"), ("in", "container", "on")):
+            if token.value == said and any(is_a(m, kind) for m in first.meant):
+                predicates = (*predicates, further)  # what stands on a board of a shelf is in it
         return [Clause(token.text, predicates, first, other, negated)]
 
     def _negation(self, head: Phrase) -> list[Clause]:

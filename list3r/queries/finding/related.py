@@ -27,9 +27,9 @@ _FAR = 1000.0
 _ON_PLAN = "far away, as on a plan with x to the right"
 _FADES = 0.1
 """Per metre: of two things to the left of another the nearer one is meant."""
-_FURTHER = "near"
+_FURTHER = ("near", "in", "on")
 _UNSURE = 0.8
-"""Share of the score that `near` has: "next to" means it too."""
+"""Share of the score of what a word also means: "next to" near, "on the shelf" in it."""
 _COMPARED: dict[str, Callable[[Instance, Instance], bool]] = {
     "larger": lambda a, b: float(np.max(a.box.size)) > float(np.max(b.box.size)),
     "smaller": lambda a, b: float(np.max(a.box.size)) < float(np.max(b.box.size)),
@@ -118,7 +118,8 @@ def _standing(
     for object in objects:
         for subject, predicate, confidence, via in pairs[object.instance.id]:
             c = subjects[subject]
-            score = c.score * confidence * (0.5 + 0.5 * object.score) * (_UNSURE if predicate == _FURTHER else 1.0)
+            further = predicate in _FURTHER and predicate != predicates[0]
+            score = c.score * confidence * (0.5 + 0.5 * object.score) * (_UNSURE if further else 1.0)
             if subject not in best or score > best[subject].score:
                 o = object.instance
                 why = f"{predicate.replace('_', ' ')} #{o.id} {o.label or o.description} ({confidence:.2f}{via})"
