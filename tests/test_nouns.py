@@ -29,6 +29,9 @@ NOUNS = st.sampled_from(sorted(all_nouns()))
 def plural(name: str) -> str:
     """The plural as people write it."""
     irregular = {"knife": "knives", "shelf": "shelves", "mouse": "mice", "person": "people", "scarf": "scarves"}
+    if " of " in name:
+        head, _, rest = name.partition(" of ")
+        return f"{plural(head)} of {rest}"
     head, _, last = name.rpartition(" ")
     if last in irregular or (last.endswith("s") and not last.endswith(("ss", "us"))):
         last = irregular.get(last, last)

@@ -17,7 +17,7 @@ from list3r.api import SceneMemory
 from list3r.cli.app import run
 from list3r.memory.errors import List3rError
 from list3r.memory.store.store import Store
-from list3r.queries.finding.grammar import relation_words
+from list3r.queries.finding.tokens import relation_words
 from list3r.queries.match import Filters, Match
 from list3r.queries.relations import ALL_PREDICATES
 from tests.conftest import THOROUGH, write_small_room

@@ -170,6 +170,26 @@ def test_left_is_as_on_a_plan_where_nobody_looks_and_as_seen_from_where_somebody
     assert names[memory.find("the leftmost chair seen from the couch")[0].instance.id] == "office_chair"
 
 
+def test_a_label_that_reads_like_a_question_is_found_by_it(tmp_path: Path) -> None:
+    shoes = {"left shoe": (1.0, 0.0, 0.05), "right shoe": (0.0, 0.0, 0.05), "the last exit": (3.0, 0.0, 1.0)}
+    said = {
+        label: {
+            "id": label,
+            "object_tag": label,
+            "object_caption": "",
+            "bbox_center": at,
+            "bbox_extent": (0.3, 0.1, 0.1),
+        }
+        for label, at in shoes.items()
+    }
+    (tmp_path / "obj_json_hall.json").write_text(json.dumps(said))
+    import_map(tmp_path / "obj_json_hall.json", tmp_path / "hall.l3r")
+    with list3r.open(tmp_path / "hall.l3r") as memory:
+        for label in shoes:
+            found = memory.find(label)
+            assert found.exact and found[0].instance.label == label
+
+
 def test_a_desk_is_no_table_where_there_is_one(room: Room) -> None:
     memory, names = room
     assert [names[m.instance.id] for m in memory.find("table")] == ["table"]

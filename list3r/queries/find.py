@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.words import adjectives, kind_word, vocabulary
+from list3r.memory.description.words import adjectives, kind_word, split_words, vocabulary
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
@@ -27,6 +27,8 @@ _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
 _LOOK = 0.8
 """Most that likeness to words counts."""
+_MOST_LABELLED = 1_000
+"""Instances with all words of a question that are looked at for their label."""
 _HOLDING = ("on", "in", "attached_to")
 
 
@@ -90,7 +92,7 @@ def find(
         viewer_from(store, viewpoint)
     found = _by_words_alone(store, question, k) if viewpoint is None else None
     if found is None:
-        found = _asked(store, question, k, viewpoint, encoder)
+        found = _labelled(store, question, k) or _asked(store, question, k, viewpoint, encoder)
     if question.kind == "count":
         found.counted = found.total if found.exact else 0
     if question.kind == "where" and found.exact:
@@ -98,6 +100,22 @@ def find(
     found.mentioned |= {m.instance.id: m.score for m in found}
     found.notes = tuple(dict.fromkeys((*found.notes, *question.notes)))
     return found
+
+
+def _labelled(store: Store, question: Question, k: int) -> Found | None:
+    """Return what bears the whole text as its label, where the text could mean more than a name: "left shoe"."""
+    words = split_words(question.text)
+    if question.kind != "which" or len(words) < 2 or question.phrases == (_plain(question.phrases[0]),):
+        return None
+    bearing = store.instances.of(store.words.bearing(words, _MOST_LABELLED)[0].tolist())
+    named = [i for i in bearing if i.state != "removed" and split_words(i.label or "") == words]
+    matches = [Match(i, 1.0, None, None, f"named {i.label}") for i in named[:k]]
+    return Found(matches, (), (), len(named)) if named else None
+
+
+def _plain(phrase: Phrase) -> Phrase:
+    """Return what a phrase is without relations, sizes, orders and uses."""
+    return Phrase(phrase.text, phrase.words, phrase.noun, phrase.meant)
 
 
 def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, encoder: WordEncoder | None) -> Found:
@@ -193,8 +211,7 @@ def _by_words_alone(store: Store, question: Question, k: int) -> Found | None:
     questions, and where no instance has the words.
     """
     phrase = question.phrases[0]
-    plain = Phrase(phrase.text, phrase.words, phrase.noun, phrase.meant)
-    if question.kind != "which" or len(question.phrases) > 1 or phrase != plain or plain.generic or not is_large(store):
+    if question.kind != "which" or question.phrases != (_plain(phrase),) or phrase.generic or not is_large(store):
         return None
     if len(phrase.meant) > 1:
         return None

@@ -101,7 +101,7 @@ def nouns_of(text: str) -> tuple[str, ...]:
     Empty where it ends in none. Of "box of cereal" what stands before "of" counts, of "pile of books" the rest.
     """
     raw, table = list(raw_words(text)), names()
-    whole, words = table.get(tuple(raw)), raw
+    whole, words = table.get(tuple(raw)) or table.get(tuple(split_words(text))), raw
     if not whole and "of" in raw[1:-1]:
         head, counted = raw[: raw.index("of")], raw[raw.index("of") + 1 :]
         words = counted if head[-1] in _COLLECTIVE else head

@@ -5,26 +5,31 @@
     second chair from the left      the chair that is not brown               plates and forks on the table
     lamp between 4 and the sofa     what is left of the sofa seen from the door?
 
-First words become tokens: fillers go, and the longest phrase of the table `phrases.json`, or of the names of nouns in
-any language, is one token. Then `_Reader` reads: a question is phrases joined by "and" or "or", then clauses; a phrase
-is attributes, a noun, an order ("largest", "second from the left"), a use, or the number of an instance. Clauses bind
-to the right: in "mug on the table near the door" the table is near the door; after "and" they bind to the first again.
+First words become tokens, see `tokens`. Then `_Reader` reads: a question is phrases joined by "and" or "or", then
+clauses; a phrase is attributes, a noun, an order ("largest", "second from the left"), a use, or the number of an
+instance. Clauses bind to the right: in "mug on the table near the door" the table is near the door; after "and" they
+bind to the first again.
 """
 
 from __future__ import annotations
 
-import json
-import re
 import string
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
-from typing import Any
 
-from list3r.memory.description.nouns import all_nouns, is_a, names, unaccented
+from list3r.memory.description.nouns import is_a
 from list3r.memory.description.words import split_words
 from list3r.memory.errors import OptionError
+from list3r.queries.finding.tokens import (
+    ENDS,
+    LONGEST,
+    Token,
+    opening,
+    openings,
+    table,
+    text_words,
+    tokens_of,
+    use_at,
+)
 
 _BOUNDS = {"floor", "wall", "ceiling"}
 """What bounds a room: what is said after one is seldom said of it."""
@@ -39,12 +44,7 @@ _INVERSE = {
 _SEVERAL = ("with", "supporting", "containing", "next to", "near")
 """Relations to all of several: "the desk with the laptop and the monitor"."""
 _MOST_WORDS = 64
-_LONGEST = 7
-"""Words of the longest phrase."""
-SIZES = {"tiny": (0.0, 0.25), "small": (0.0, 0.5), "medium": (0.2, 0.8), "large": (0.5, 1.0), "huge": (0.75, 1.0)}
-"""Words of size, and which part they are of what there is, ordered by size."""
 _WHERE = ("where", "wo", "où", "dónde", "donde", "dove")
-_ASIAN = r"\u3040-\u30ff\u3400-\u9fff"
 
 
 @dataclass(frozen=True)
@@ -131,91 +131,24 @@ class Question:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class _Token:
-    kind: str
-    """word, noun, thing, relation, order, rank, size, number, use, change, and, or, not."""
-    text: str
-    value: Any = None
-
-
-@cache
-def _table() -> dict[str, Any]:
-    table: dict[str, Any] = json.loads(Path(__file__).with_name("phrases.json").read_text(encoding="utf-8"))
-    return table
-
-
-@cache
-def _phrases() -> dict[tuple[str, ...], _Token]:
-    """Return the tokens of all words and phrases of the table that are more than names."""
-    table = _table()
-    out: dict[tuple[str, ...], _Token] = {}
-    out |= {tuple(_words(p)): _Token("filler", p) for p in (*table["fillers"].split(), *table["phrases"].split("|"))}
-    out |= {(w,): _Token("thing", w) for w in table["generic"].split()}
-    for kind in ("and", "or", "not"):
-        out |= {(w,): _Token(kind, w) for w in table[kind].split()}
-    for kind, group in (("order", "orders"), ("relation", "relations"), ("change", "changes")):
-        out |= {tuple(_words(p)): _Token(kind, p, key) for key, many in table[group].items() for p in many.split("|")}
-    out |= {(w,): _Token("rank", w, n) for w, n in table["ranks"].items()}
-    return out
-
-
-@cache
-def relation_words() -> dict[str, tuple[str, ...]]:
-    """Return what people say of how things stand to each other, and the predicates that it may mean."""
-    said = _table()["relations"].items()
-    return {phrase: tuple(_table()["predicates"][key]) for key, many in said for phrase in many.split("|")}
-
-
-@cache
-def _openings(name: str) -> frozenset[tuple[str, ...]]:
-    said: Iterable[str] = _table()[name].split("|") if isinstance(_table()[name], str) else _table()[name]
-    return frozenset(tuple(_words(p)) for p in said)
-
-
-def _words(text: str) -> list[str]:
-    """Return words as they stand, short forms in full; what is written without spaces comes apart at known nouns."""
-    text = re.sub(r"[’`]", "'", text.lower())
-    text = re.sub(r"n't\b", " not", text.replace("can't", "can not").replace("cannot", "can not"))
-    text = re.sub(r"\b(what|where|who|which|that|there|it|how|here)'s\b", r"\1 is", text).replace("i'm ", "i am ")
-    text = re.sub(r"'s\b", "", text)
-    text = re.sub(f"[{_ASIAN}]+", lambda found: f" {' '.join(_apart(found[0]))} ", text)
-    return re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text)
-
-
-def _apart(run: str) -> list[str]:
-    """Return the words of Japanese or Chinese that the tables know, the one spoken of before what it is next to."""
-    for particle, relation in _table()["asian"].items():
-        before, found, after = run.partition(particle)
-        if found and before and after:
-            return [*_apart(after), *relation.split(), *_apart(before)]
-    out, k = [], 0
-    while k < len(run):
-        known = (run[k:end] for end in range(len(run), k, -1))
-        word = next((w for w in known if (w,) in names() or split_words(w) != [w]), None)
-        out += [] if word is None else [word]
-        k += 1 if word is None else len(word)
-    return out
-
-
 def parse(text: str) -> Question:
     """Read a question. Raises `OptionError` for a text of spaces and punctuation; anything else is a question."""
-    words = _words(text)
+    words = text_words(text)
     if not text.strip(string.punctuation + string.whitespace):
         raise OptionError(f"{text!r} has no word to search for; ask for something such as: white mug on table")
     notes = []
     if len(words) > _MOST_WORDS:
         notes.append(f"the question has {len(words)} words; the first {_MOST_WORDS} were read")
         words = words[:_MOST_WORDS]
-    words, place = _split_off(words, _openings("seen_from"))
+    words, place = _split_off(words, openings("seen_from"))
     kind, words = _kind(_adjectives_first(_with_its_end(words)))
     bounds, words = _bounds_of(words) if kind == "exists" else ((1, None), words)
-    tokens = _tokens(words) or ([_Token("word", text, text)] if not _words(text) else [])
+    tokens = tokens_of(words) or ([Token("word", text, text)] if not text_words(text) else [])
     if kind == "exists" and len(tokens) > 1 and tokens[-1].kind == "relation":
-        tokens[-1] = _Token("word", tokens[-1].text, tokens[-1].text)  # is the lamp on
+        tokens[-1] = Token("word", tokens[-1].text, tokens[-1].text)  # is the lamp on
     reader = _Reader(tokens)
     phrases, every = reader.question()
-    seen_from = _Reader(_tokens(place)).question()[0][0] if place else None
+    seen_from = _Reader(tokens_of(place)).question()[0][0] if place else None
     if reader.places:
         notes.append(f"rooms are not told apart: {reader.places[0]!r} was left out")
     all_of = kind == "exists" and bool({"all", "every", "each", "both"} & set(words))
@@ -226,7 +159,7 @@ def _bounds_of(words: list[str]) -> tuple[tuple[int, int | None], list[str]]:
     """Return how many there must and may be for a yes, and the words after that: "more than two plants"."""
     said = [w for w in words[:4] if w not in ("than", "at", "exactly", "only", "just", "the")]
     compared = said[0] if said and said[0] in ("more", "fewer", "less", "least", "most") else ""
-    number = _table()["numbers"].get(said[bool(compared)], said[bool(compared)]) if len(said) > bool(compared) else ""
+    number = table()["numbers"].get(said[bool(compared)], said[bool(compared)]) if len(said) > bool(compared) else ""
     if not str(number).isdigit() or len(words) < 2:
         return (1, None), words
     count, exact = int(number), "exactly" in words[:2]
@@ -240,7 +173,7 @@ def _adjectives_first(words: list[str]) -> list[str]:
     """Return words with what is said of the first thing at the end before it: "things on the desk that are white"."""
     for k in range(len(words) - 2, 0, -1):
         if words[k - 1] in ("that", "which") and words[k] in ("is", "are"):
-            last = _tokens(words[k + 1 :])
+            last = tokens_of(words[k + 1 :])
             return [*words[k + 1 :], *words[: k - 1]] if last and all(t.kind == "word" for t in last) else words
     return words
 
@@ -252,7 +185,7 @@ def _with_its_end(words: list[str]) -> list[str]:
         following = words[k + 1 : k + 2]
         if joined is None or not following or following[0] in ("to", "from", "away"):
             continue
-        if following[0] in _table()["articles"].split():
+        if following[0] in table()["articles"].split():
             return [*words[: k + 1], joined, *words[k + 1 :]]
         end = next((n for n in range(k + 2, len(words)) if words[n] in ("to", "from")), None)
         if end is not None:
@@ -263,7 +196,7 @@ def _with_its_end(words: list[str]) -> list[str]:
 def _split_off(words: list[str], marks: frozenset[tuple[str, ...]]) -> tuple[list[str], list[str]]:
     """Return the words before and after the first of some marks."""
     for k in range(len(words)):
-        for length in range(_LONGEST, 0, -1):
+        for length in range(LONGEST, 0, -1):
             if tuple(words[k : k + length]) in marks:
                 return words[:k], words[k + length :]
     return words, []
@@ -273,134 +206,24 @@ def _kind(words: list[str]) -> tuple[str, list[str]]:
     """Return what kind of question begins so, and the words after its opening."""
     kind, asked, asks = "which", False, {"counts": "count", "yes_no": "exists", "openers": ""}
     while words:
-        length, name = max((_opening(words, _openings(n)), n) for n in asks)
+        length, name = max((opening(words, openings(n)), n) for n in asks)
         if not length or (asks[name] and asked):
             break
         if asks[name]:
             return asks[name], words[length:]
         asked = asked or words[0] in (*_WHERE, "what", "which")
         kind = "where" if words[0] in _WHERE else kind
-        if asked and _use_at(words, length)[0]:
+        if asked and use_at(words, length)[0]:
             return "which", words[length:]
         words = words[length:]
         words = words[1:] if words and words[0] in ("me", "the", "is", "are") and len(words) > 1 else words
     return kind, words
 
 
-def _opening(words: list[str], openings: frozenset[tuple[str, ...]]) -> int:
-    return next((n for n in range(min(_LONGEST, len(words)), 0, -1) if tuple(words[:n]) in openings), 0)
-
-
-# ---------------------------------------------------------------------------------------------- tokens
-
-
-def _tokens(words: list[str]) -> list[_Token]:
-    out: list[_Token] = []
-    articles = _table()["articles"].split()
-    k = 0
-    while k < len(words):
-        length, token = _token_at(words, k)
-        if token.kind != "filler":
-            out.append(token)
-        elif words[k] in ("have", "has") and k + 1 < len(words) and any(t.kind == "noun" for t in out):
-            out.append(_Token("relation", words[k], "with"))
-        elif words[k] in articles and out and out[-1].kind in ("noun", "word"):
-            last_words = k + 1 < len(words) and _token_at(words, k + 1)[1].kind in ("order", "rank")
-            since = 0 if last_words else next((n for n in range(len(out), 0, -1) if out[n - 1].kind == "noun"), 0)
-            if since and all(t.kind == "word" for t in out[since:]):
-                # Another thing begins, and how it stands to the first was not understood: the chair facing the desk.
-                out[since:] = [_Token("relation", " ".join(t.text for t in out[since:]) or "near", "near")]
-        k += length
-    return out
-
-
-def _token_at(words: list[str], k: int) -> tuple[int, _Token]:
-    """Return the longest token that begins at a word: a use, a phrase of the table, a noun, or the word alone."""
-    length, use = _use_at(words, k)
-    if use:
-        return length, _Token("use", " ".join(words[k : k + length]), use)
-    if re.fullmatch(r"#?[0-9]+", words[k]):
-        return 1, _Token("number", words[k], int(words[k].removeprefix("#")[:30]))
-    phrases = _phrases()
-    for n in range(min(_LONGEST, len(words) - k), 0, -1):
-        part = tuple(words[k : k + n])
-        without = tuple(w for w in part if w not in ("the", "a"))
-        shaded = n == 1 and part[0] in ("light", "dark") and split_words(" ".join(words[k + 1 : k + 2]))
-        if shaded and shaded[0] in ("blue", "red", "green", "grey", "brown", "yellow"):
-            return 1, _Token("word", part[0], part[0])
-        if part in phrases or (n > 2 and part[0] != "the" and part[-1] != "the" and without in phrases):
-            return n, phrases.get(part) or phrases[without]
-        meant = _meant(part)
-        if meant:
-            return n, _Token("noun", " ".join(part), meant)
-    word = split_words(words[k])[0]
-    if word in _table()["generic"].split():
-        return 1, _Token("thing", word)
-    return 1, _Token("size" if word in SIZES else "word", words[k], word)
-
-
-def _meant(part: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the nouns that words mean: as they stand, singular, without accents, or without a German plural's end."""
-    table = names()
-    found = (*table.get(part, ()), *table.get(tuple(split_words(" ".join(part))), ()))
-    if not found and len(part) == 1 and len(part[0]) > 4 and split_words(part[0]) == [part[0]]:
-        plain = unaccented(part[0])
-        ends = (plain, *(plain.removesuffix(e) for e in ("e", "er", "en", "n")), *(plain[:-1] + e for e in "aoe"))
-        found = next((table[(w,)] for w in ends if (w,) in table), ())
-    return tuple(dict.fromkeys(found))
-
-
-@cache
-def _uses() -> dict[tuple[str, ...], tuple[str, ...]]:
-    """Return the nouns by the words of a use."""
-    out: dict[tuple[str, ...], list[str]] = {}
-    for n in all_nouns().values():
-        for use in n.uses:
-            out.setdefault(_content(use.split()), []).append(n.name)
-    return {words: tuple(found) for words, found in out.items()}
-
-
-def _content(words: Iterable[str]) -> tuple[str, ...]:
-    idle = ("the", "a", "an", "my", "one's", "some", "one", "s", "our", "your", "down", "up", "any", "oneself")
-    return tuple(split_words(" ".join(w for w in words if w not in idle)))
-
-
-def _use_at(words: list[str], k: int) -> tuple[int, tuple[str, ...]]:
-    """Return (how many words, the nouns) of a use that begins at a word: "to sit on", "I can write at"."""
-    start = _opening(words[k:], _openings("can"))
-    rest = words[k + start :]
-    if not start or not rest:
-        return 0, ()
-    uses = _uses()
-    ends = [n for n in range(1, len(rest) + 1) if n == len(rest) or _kind_of(rest[n]) in _ENDS]
-    for n in (n for n in reversed(ends) if n <= _LONGEST):
-        if found := uses.get(_content(rest[:n])):
-            return start + n, found
-    end = ends[0]
-    said = _content(rest[:end])
-    verb = said[0] if said else ""
-    if words[k] == "for":
-        verb = verb.removesuffix("ing")
-    alike = {use: len(set(said) & set(use)) for use in uses if use[0] == verb and verb not in ("have", "be")}
-    most = max(alike.values(), default=0)
-    best = [n for use, shared in alike.items() if shared == most for n in uses[use]]
-    return (start + end, tuple(dict.fromkeys(best))) if best else (0, ())
-
-
-def _kind_of(word: str) -> str:
-    return _phrases()[(word,)].kind if (word,) in _phrases() else ""
-
-
-_ENDS = ("relation", "and", "or", "not", "order")
-
-
-# ---------------------------------------------------------------------------------------------- phrases
-
-
 class _Reader:
     """Reads tokens into phrases and clauses, left to right."""
 
-    def __init__(self, tokens: list[_Token]) -> None:
+    def __init__(self, tokens: list[Token]) -> None:
         self._tokens = tokens
         self._at = 0
         self.places: list[str] = []
@@ -445,7 +268,7 @@ class _Reader:
         at = self._at + ahead
         return self._tokens[at].kind if at < len(self._tokens) else ""
 
-    def _take(self) -> _Token:
+    def _take(self) -> Token:
         self._at += 1
         return self._tokens[self._at - 1]
 
@@ -472,10 +295,10 @@ class _Reader:
     def _joins(self) -> bool:
         """Whether what follows an "and" stands for itself: it has a relation of its own."""
         following = (t.kind for t in self._tokens[self._at + 1 :])
-        return next((k == "relation" for k in following if k in _ENDS), False)
+        return next((k == "relation" for k in following if k in ENDS), False)
 
-    def _relation(self, token: _Token, head: Phrase, *, negated: bool = False) -> list[Clause]:
-        predicates = tuple(_table()["predicates"][token.value])
+    def _relation(self, token: Token, head: Phrase, *, negated: bool = False) -> list[Clause]:
+        predicates = tuple(table()["predicates"][token.value])
         first = self._phrase()
         other = None
         if token.value == "between":
@@ -484,7 +307,7 @@ class _Reader:
                 other = self._phrase()
             elif first.generic:
                 return []
-        if first.generic and first.order is None and first.text in (*_table()["places"].split(), "anything"):
+        if first.generic and first.order is None and first.text in (*table()["places"].split(), "anything"):
             if first.text != "anything":
                 self.places.append(first.text)
             return []
@@ -514,14 +337,14 @@ class _Reader:
 
     def _phrase(self) -> Phrase:
         """Return what stands up to a clause or a join."""
-        tokens: list[_Token] = []
+        tokens: list[Token] = []
         while self._next() not in ("", "and", "or", "not", "relation"):
             token = self._take()
             if token.value in ("nearest", "farthest"):
                 to = self._measured_from() if token.text.endswith((" to", " from")) else None
-                token = _Token("order", token.text, Order(token.value, to=to))
+                token = Token("order", token.text, Order(token.value, to=to))
             elif token.kind == "order":
-                token = _Token("order", token.text, Order(token.value))
+                token = Token("order", token.text, Order(token.value))
             tokens.append(token)
         return _phrase_of(tokens)
 
@@ -549,7 +372,7 @@ def _completed(heads: list[Phrase], *, every: bool) -> list[Phrase]:
     return [*(replace(last, text=f"{h.text} {' '.join(last.noun)}", words=h.words) for h in bare), last]
 
 
-def _phrase_of(tokens: list[_Token]) -> Phrase:
+def _phrase_of(tokens: list[Token]) -> Phrase:
     """Return the phrase of attributes, nouns of which the last names it, and what else was said of it."""
     last = {t.kind: t for t in tokens}
     noun = None if "use" in last else last.get("noun")
@@ -567,7 +390,7 @@ def _phrase_of(tokens: list[_Token]) -> Phrase:
         order = replace(order, rank=last["rank"].value)
     named = last.get("use", noun)
     text = " ".join(t.text for t in tokens)
-    places = _table()["places"].split()
+    places = table()["places"].split()
     if words and set(words) <= set(places) and {t.kind for t in tokens} == {"word"}:
         return Phrase(words[0])
     return Phrase(
@@ -584,5 +407,5 @@ def _phrase_of(tokens: list[_Token]) -> Phrase:
     )
 
 
-def _name(token: _Token) -> tuple[str, ...]:
+def _name(token: Token) -> tuple[str, ...]:
     return tuple(split_words(token.text))
