@@ -86,6 +86,12 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
         ("a lamp smaller than the cat", ""),
         ("a lamp taller than the moon", ""),
         ("which lamp is the largest?", "floor_lamp"),
+        (
+            "a thing that is not on the desk or the table",
+            "table desk floor_lamp chair chair_2 office_chair sofa cat door",
+        ),
+        ("furniture items taller than the couch", ""),
+        ("lamps shorter than the floor lamp", "lamp"),
         ("Katze", "cat"),
         ("wo ist der Stuhl neben dem Schreibtisch", "office_chair"),
         ("la tasse sur la table", "mug"),

@@ -17,7 +17,7 @@ import string
 from dataclasses import dataclass, replace
 
 from list3r.memory.description.nouns import is_a
-from list3r.memory.description.words import split_words
+from list3r.memory.description.words import adjectives, split_words
 from list3r.memory.errors import OptionError
 from list3r.queries.finding.tokens import (
     ENDS,
@@ -322,9 +322,14 @@ class _Reader:
 
     def _negation(self, head: Phrase) -> list[Clause]:
         """Return what must not hold: a relation, or to be what a phrase says, whose noun may be left out."""
+        out: list[Clause] = []
         if self._next() == "relation":
-            return self._relation(self._take(), head, negated=True)
-        out = []
+            token = self._take()
+            out = self._relation(token, head, negated=True)
+            while self._next() in ("and", "or") and not self._joins():
+                self._take()  # not on the desk or the table
+                out += self._relation(token, head, negated=True)
+            return out
         while True:
             phrase = self._phrase()
             if self._next() == "relation":
@@ -376,8 +381,8 @@ def _phrase_of(tokens: list[Token]) -> Phrase:
     """Return the phrase of attributes, nouns of which the last names it, and what else was said of it."""
     last = {t.kind: t for t in tokens}
     noun = None if "use" in last else last.get("noun")
-    if noun is not None and "thing" in last and last["thing"].text in ("thing", "one", "object", "item"):
-        noun = noun if "word" in last else None  # the orange one
+    if noun is not None and "thing" in last and noun.text in adjectives():
+        noun = None  # the orange one
     words = [
         w
         for t in tokens
