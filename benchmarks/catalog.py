@@ -37,6 +37,7 @@ from list3r.catalog.records import (
     MemoryEntry,
     SpaceVectors,
 )
+from list3r.memory.description.words import kind_word
 from list3r.memory.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from tests.postgres_server import PostgresServer, running_postgres
@@ -352,7 +353,7 @@ def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.rand
         label, color = KINDS[kinds[n]], COLORS[colors[n]]
         box = OrientedBox(centers[n], sizes[n], np.eye(3))
         told = (label, f"{color} box, 20 cm", "present", None, float(chance.uniform(0.3, 1.0)), 0.01, 1, box)
-        things.append(CatalogThing(name, n, *told, {label: 100, color: 90, "box": 80}))
+        things.append(CatalogThing(name, n, *told, {label: 100, kind_word(label): 100, color: 90, "box": 80}))
     pairs = chance.integers(0, count, (2 * count, 2))
     relations = [
         (int(a), "on" if k % 2 else "near", int(b), 0.8, 0.1) for k, (a, b) in enumerate(np.unique(pairs, axis=0))

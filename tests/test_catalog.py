@@ -23,6 +23,7 @@ from list3r.catalog.catalog import box_distances
 from list3r.catalog.reading import read_content
 from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.cli.app import run as list3r
+from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import List3rError, OptionError, SpaceMismatchError, UnknownIdError
 from list3r.memory.geometry import OrientedBox, rotation_exp
 from list3r.memory.store.store import Store
@@ -69,7 +70,8 @@ def content(name: str, count: int = 120, seed: int = 1) -> MemoryContent:
         label, structure = ("mug", "box", "lamp")[n % 3], "floor" if n % 10 == 9 else None
         state = "removed" if n % 7 == 6 else "present"
         told = (label, f"red {label}", state, structure, float(n % 5) / 5 + 0.1, 0.01, 1, box)
-        things.append(CatalogThing(name, n, *told, {label: 100, "red": 90}))
+        words = {word: round(100 * fits) for word, fits in vocabulary(label, None, f"red {label}", "dark red").items()}
+        things.append(CatalogThing(name, n, *told, words))
     relations = [(n, "on", n + 1, 0.9, 0.1) for n in range(0, count - 1, 2)]
     vectors = chance.normal(size=(count, 16)).astype(np.float32)
     entry = MemoryEntry(name, f"/none/{name}.l3r", 0, f"{name}{seed}", 9, 0, "relative", "known", count, 1)

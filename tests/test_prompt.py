@@ -116,7 +116,10 @@ def test_a_question_brings_what_it_names_to_the_front(many: SceneMemory) -> None
     assert by_words and all(many.instance(n).description == "lamp" for n in by_words)
     by_id = many.prompt(300, "what is beside #157?").listed
     assert by_id[0] == 157 and set(by_id[1:5]) <= {156, 158, 137, 177}
-    assert many.prompt(200, "zebras").listed == many.prompt(200).listed
+    unknown = many.prompt(200, "zebras")
+    assert unknown.listed == many.prompt(200).listed[: len(unknown.listed)]
+    assert "no thing is known as 'zebra'" in unknown.text
+    assert "no thing is known" not in many.prompt(200, "which lamp is the nearest?").text
 
 
 def test_a_memory_without_scale_or_up_says_so(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import OptionError, UnknownIdError
+from list3r.memory.errors import OptionError
 from list3r.memory.records import Relation
 from list3r.memory.store.store import Store
 from list3r.queries.find import Found, find
@@ -50,9 +50,9 @@ def ids(found: Found) -> list[int]:
     [
         ("mug", [MUG]),
         ("mugs", [MUG]),
-        ("the cups", [MUG]),
+        ("the cup", []),
         ("white mug on table", [MUG]),
-        ("white mug on the desk", [MUG]),
+        ("white mug on the desk", []),
         ("cylinders on the table", [MUG, TWIN]),
         ("red cylinder", [TWIN]),
         ("dark red things", [TWIN]),
@@ -80,7 +80,9 @@ def test_what_a_text_means(store: Store, text: str, expected: list[int]) -> None
     with_inverses = {"table with a mug", "table next to the chair and with a mug"}
     if text in with_inverses:
         store.relations.replace([], [Relation(TABLE, "supports", MUG, 0.95, 0.02)])
-    assert sorted(ids(find(store, text, 9))) == expected
+    found = find(store, text, 9)
+    assert (sorted(ids(found)) if found.exact else []) == expected
+    assert found.exact or all(m.score < 0.7 for m in found)
 
 
 def test_words_that_nothing_bears_are_named_with_those_that_things_bear(store: Store) -> None:
@@ -90,9 +92,11 @@ def test_words_that_nothing_bears_are_named_with_those_that_things_bear(store: S
 
 
 def test_what_does_not_hold_is_said(store: Store) -> None:
-    assert find(store, "white table").notes == ("no instance matches all of the words 'white', 'table'",)
+    found = find(store, "white table")
+    assert "no instance matches all of the words 'white', 'table'" in found.notes
+    assert ids(found) == [TABLE] and not found.exact and found[0].score < 0.7
     found = find(store, "mug on chair")
-    assert found == [] and "on" in found.notes[0] and found.unknown_words == ()
+    assert not found.exact and "on" in found.notes[0] and found.unknown_words == ()
 
 
 def test_ambiguous_answers_are_ranked_with_reasons(store: Store) -> None:
@@ -109,17 +113,15 @@ def test_sides_depend_on_who_looks(store: Store) -> None:
     here = (0.0, 0.0, 1.0)
     assert ids(find(store, "cylinder left of 4", viewpoint=here)) == [MUG]
     assert ids(find(store, "cylinder right of 3", viewpoint=here)) == [TWIN]
-    assert ids(find(store, "cylinder left of 4", viewpoint=(4.0, 0.0, 1.0))) == []
+    assert not find(store, "cylinder left of 4", viewpoint=(4.0, 0.0, 1.0)).exact
     assert "as seen from frame 3" in find(store, "mug left of the red cylinder")[0].reason
 
 
 def test_what_is_between(store: Store) -> None:
     assert MUG not in ids(find(store, "thing between 3 and 4"))
-    with pytest.raises(OptionError, match="two things"):
-        find(store, "thing between 3")
 
 
-@pytest.mark.parametrize("text", ["", "   ", "!?", "mug on", "on", "left of the", "between 3 and", "mug " * 100])
+@pytest.mark.parametrize("text", ["", "   ", "!?", "..."])
 def test_texts_without_sense_are_refused_in_one_line(store: Store, text: str) -> None:
     with pytest.raises(OptionError) as caught:
         find(store, text)
@@ -128,8 +130,8 @@ def test_texts_without_sense_are_refused_in_one_line(store: Store, text: str) ->
 
 def test_numbers_that_are_no_ids_are_told(store: Store) -> None:
     for text in ("chair next to 77", "99999999999999999999999999", "mug on #0"):
-        with pytest.raises(UnknownIdError):
-            find(store, text)
+        found = find(store, text)
+        assert not found.exact and any("has no instance" in note for note in found.notes)
 
 
 def test_vertical_relations_are_unknown_without_gravity(store: Store) -> None:
@@ -138,7 +140,8 @@ def test_vertical_relations_are_unknown_without_gravity(store: Store) -> None:
     store.facts.gravity = "unknown"
     try:
         found = find(store, "mug on table")
-        assert found == [] and any("unknown" in n for n in found.notes)
+        assert not found.exact and any("unknown" in n for n in found.notes)
+        assert find(store, "is there a mug on the table?").answer is None
         assert ids(find(store, "chair next to table")) == [CHAIR]
     finally:
         store.facts.gravity = "estimated"
@@ -157,25 +160,25 @@ class Letters:
 
 def test_a_text_encoder_stands_in_where_no_thing_bears_a_word(store: Store) -> None:
     encoder = Letters()
-    assert find(store, "elbat", encoder=encoder) == []
+    assert find(store, "elbat", encoder=encoder) == [] and find(store, "elbat").unknown_words == ("elbat",)
     vectors = np.stack([encoder.encode("table"), encoder.encode("xyz")])
     store.embeddings.put(encoder.space, [TABLE, MUG], vectors)
     found = find(store, "elbat", encoder=encoder)
-    assert ids(found) == [TABLE] and "cosine 1.00" in found[0].reason
+    assert ids(found) == [TABLE] and "cosine 1.00" in found[0].reason and not found.exact and found[0].score < 0.9
     assert ids(find(store, "mug", encoder=encoder)) == [MUG]
     assert ids(find(store, "mug on elbat", encoder=encoder)) == [MUG]
 
 
 def test_the_grammar_binds_to_the_right_and_and_to_the_first() -> None:
-    phrase = parse("white mugs on the table near the door")
-    assert phrase.words == ("white", "mug") and len(phrase.where) == 1
-    assert phrase.where[0].object.words == ("table",)
+    (phrase,) = parse("white mugs on the table near the door").phrases
+    assert (phrase.words, phrase.noun, phrase.meant) == (("white",), ("mug",), ("mug",)) and len(phrase.where) == 1
+    assert phrase.where[0].object.noun == ("table",)
     assert phrase.where[0].object.where[0].wording == "near"
-    flat = parse("mug on the table and next to 12")
+    (flat,) = parse("mug on the table and next to 12").phrases
     assert [c.wording for c in flat.where] == ["on", "next to"] and flat.where[1].object.instance_id == 12
-    two = parse("lamp between the sofa and the table and near 3")
-    assert two.where[0].other is not None and two.where[0].other.words == ("table",) and two.where[1].wording == "near"
-    assert parse("mug to the left of 3").where[0].predicates == ("left_of",)
+    (two,) = parse("lamp between the sofa and the table and near 3").phrases
+    assert two.where[0].other is not None and two.where[0].other.noun == ("table",) and two.where[1].wording == "near"
+    assert parse("mug to the left of 3").phrases[0].where[0].predicates == ("left_of",)
 
 
 def test_an_empty_memory_answers_nothing(tmp_path: Path) -> None:

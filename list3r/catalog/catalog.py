@@ -27,9 +27,12 @@ from list3r.catalog.records import (
     UnknownMemoryError,
     Wanted,
 )
+from list3r.memory.description.words import kind_word
 from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError, naming_extras
+from list3r.memory.relations.predicates import PREDICATES
 from list3r.memory.search.vectors import unit_query
 from list3r.queries.finding.grammar import Phrase, parse
+from list3r.queries.finding.naming import tiers
 from list3r.queries.finding.words import STRUCTURE, wanted_words
 from list3r.queries.match import checked_count, checked_length, checked_point
 from list3r.queries.relations import ALL_PREDICATES
@@ -188,18 +191,49 @@ class Catalog:
     def find(
         self, text: str, memory: str | None = None, *, k: int = 5, filters: CatalogFilters | None = None
     ) -> CatalogAnswers:
-        """Find things by a phrase, in one memory or over all: words, and stored relations to what other words name.
+        """Answer a question, in one memory or over all: names in any word for them, and stored relations to others.
 
         Sizes, superlatives and what depends on a viewpoint are questions to one file. Raises `OptionError`.
         """
         k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
-        wanted = _wanted(parse(text))
-        if not STRUCTURE.isdisjoint(wanted.words):
-            filters = CatalogFilters(True, filters.min_confidence, filters.state)
-        found, ranked = self._backend.named(memory, wanted, k, filters)
-        notes = [f"{ranked} or more things match {text!r}; only {ranked} were ranked"] if ranked >= MOST_RANKED else []
-        wording = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
-        return self._answers(((t, score, None, wording) for t, score in found), entries, notes)
+        question = parse(text)
+        best: dict[tuple[str, int], tuple[CatalogThing, float, None, str]] = {}
+        total, notes, fits = 0, list(question.notes), []
+        for phrase in question.phrases:
+            found, ranked = self._named(memory, phrase, k, filters)
+            fits.append(question.at_least <= ranked <= (MOST_RANKED if question.at_most is None else question.at_most))
+            total += ranked
+            if ranked >= MOST_RANKED:
+                notes.append(f"{ranked} or more things match {text!r}; only {ranked} were ranked")
+            for t, score, wording in found:
+                best.setdefault((t.memory, t.id), (t, score, None, wording))
+        rows = sorted(best.values(), key=lambda row: -row[1])[:k]
+        out = self._answers(rows, entries, notes)
+        if question.kind == "count":
+            out.counted = total
+        if question.kind == "exists":
+            out.answer = "yes" if (all(fits) if question.every else any(fits)) else "no"
+        return out
+
+    def _named(
+        self, memory: str | None, phrase: Phrase, k: int, filters: CatalogFilters
+    ) -> tuple[list[tuple[CatalogThing, float, str]], int]:
+        """Return the k best that a phrase means, by the first of its nouns that names any, and how many there are."""
+        for nouns in tiers(phrase):
+            found: dict[tuple[str, int], tuple[CatalogThing, float, str]] = {}
+            total = 0
+            for noun in nouns or (None,):
+                wanted = _wanted(phrase, noun)
+                structure = not STRUCTURE.isdisjoint((*phrase.all_words, noun))
+                chosen = CatalogFilters(True, filters.min_confidence, filters.state) if structure else filters
+                rows, ranked = self._backend.named(memory, wanted, k, chosen)
+                total += ranked
+                wording = f"named {' '.join(phrase.words + ((noun,) if noun else phrase.noun))}".strip()
+                for t, score in rows:
+                    found.setdefault((t.memory, t.id), (t, score, wording if wanted.words else "stands so"))
+            if found:
+                return list(found.values()), total
+        return [], 0
 
     def similar(
         self,
@@ -396,25 +430,29 @@ def _rounded(numbers: Iterable[float]) -> list[float]:
     return [round(x, 4) for x in numbers]
 
 
-def _wanted(phrase: Phrase) -> Wanted:
+def _wanted(phrase: Phrase, noun: str | None) -> Wanted:
     """Return a phrase as what the database can look for. Raises `OptionError` for what only a file can tell."""
+    negated = next((c for c in phrase.where if c.negated), None)
     for what, beyond in (
         (phrase.size, phrase.size is not None),
-        (phrase.superlative, phrase.superlative is not None),
+        (phrase.order and phrase.order.by, phrase.order is not None),
         (f"#{phrase.instance_id}", phrase.instance_id is not None),
+        (phrase.change, phrase.change is not None),
         ("between", any(c.other for c in phrase.where)),
+        (negated and f"not {negated.object.text}", negated is not None),
     ):
         if beyond:
             raise OptionError(f"{phrase.text!r}: a catalogue cannot answer {what!r}; ask the memory file")
     where = []
     for clause in phrase.where:
-        stored = tuple(p for p in clause.predicates if p not in VIEWPOINT)
+        stored = tuple(p for p in clause.predicates if p in PREDICATES)
         if not stored:
             raise OptionError(f"{phrase.text!r}: {clause.wording!r} depends on the viewpoint; ask the memory file")
-        where.append((stored, _wanted(clause.object)))
-    if not phrase.words and not where:
+        where.append((stored, _wanted(clause.object, next(iter(clause.object.meant), None))))
+    words = (*phrase.words, kind_word(noun)) if noun else phrase.all_words
+    if not words and not where:
         raise OptionError(f"{phrase.text!r} has no word to search for; name an object, a colour or a shape")
-    return Wanted(phrase.words, None, tuple(where))
+    return Wanted(words, None, tuple(where))
 
 
 def _count(k: int) -> int:

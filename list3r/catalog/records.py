@@ -175,3 +175,12 @@ class CatalogAnswers(list[Any]):
     def __init__(self, found: Iterable[Any] = (), notes: Sequence[str] = ()) -> None:
         super().__init__(found)
         self.notes = tuple(dict.fromkeys(notes))
+        self.counted: int | None = None
+        """How many there are, for a question that asks so."""
+        self.answer: str | None = None
+        """yes or no, for a question that asks so."""
+
+    def facts(self) -> dict[str, object]:
+        """Return what is said of the answer as a whole; nothing where the question asks for neither."""
+        facts = {"count": self.counted, "answer": self.answer}
+        return {name: value for name, value in facts.items() if value is not None}

@@ -9,7 +9,8 @@ from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.find import meant
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.finding.grammar import parse
+from list3r.queries.finding.grammar import Phrase, parse
+from list3r.queries.finding.naming import looser
 from list3r.queries.finding.words import STRUCTURE, no_such_words, wanted_words, word_score
 from list3r.queries.match import Filters
 from list3r.queries.views.gather import is_large, sample
@@ -29,12 +30,17 @@ def named_by(
     notes: list[str],
 ) -> list[tuple[Instance, float, str]]:
     """Return what the words say, with how well and why: a phrase as `find` reads it, else things that have them."""
-    if _says_more_than_names(words):
-        found, search = meant(store, parse(words), encoder=encoder)
-        notes += search.notes
-        return [(c.instance, c.score, "; ".join(c.reasons)) for c in found if filters.passes(c.instance)]
+    phrases = [p for p in parse(words).phrases if not p.generic or p.where or p.order or p.size]
+    if _says_more(phrases) or not is_large(store):
+        named, said = _meant(store, phrases, filters, encoder)
+        if named or _says_more(phrases):
+            notes += said
+            return named
     others = [i for i in _with_words(store, words, filters, notes) if origin is None or i.id != origin.id]
-    named = _named(others, words)
+    named = _named(others, words) or _meant(store, phrases, filters)[0]
+    for phrase, share, why in (n for p in phrases for n in looser(p)) if not named and encoder is None else ():
+        found, _ = _meant(store, [phrase], filters)
+        named = named or [(i, round(share * score, 4), f"{reason}; {why}") for i, score, reason in found]
     if not named and encoder is not None:
         named = _alike(store, encoder, words, filters, notes)
     if not named and (unknown := [w for w in wanted_words(words) if w not in store.words.known([w])]):
@@ -42,17 +48,28 @@ def named_by(
     return named
 
 
-def _says_more_than_names(words: str) -> bool:
-    try:
-        phrase = parse(words)
-    except OptionError:  # such as "mug on": a name that ends in a relation
-        return False
-    return bool(phrase.where or phrase.size or phrase.superlative or phrase.instance_id is not None)
+def _meant(
+    store: Store, phrases: Sequence[Phrase], filters: Filters, encoder: WordEncoder | None = None
+) -> tuple[list[tuple[Instance, float, str]], list[str]]:
+    """Return what phrases mean that passes the filters, with how well and why, and notes."""
+    found: dict[int, tuple[Instance, float, str]] = {}
+    notes: list[str] = []
+    for phrase in phrases:
+        matches, search = meant(store, phrase, encoder=encoder)
+        notes += search.notes
+        for c in (c for c in matches if filters.passes(c.instance)):
+            found.setdefault(c.instance.id, (c.instance, round(c.score, 4), "; ".join(filter(None, c.reasons))))
+    return list(found.values()), notes
+
+
+def _says_more(phrases: Sequence[Phrase]) -> bool:
+    """Tell whether phrases say more than names."""
+    return any(p.where or p.size or p.order or p.use or p.instance_id is not None for p in phrases)
 
 
 def only_common(store: Store, words: str) -> bool:
     """Tell whether the words only name, and so many have them that it is better to look around than at all of them."""
-    if _says_more_than_names(words):
+    if _says_more(parse(words).phrases):
         return False
     return len(store.words.bearing(wanted_words(words), _LOADED + 1)[0]) > _LOADED
 

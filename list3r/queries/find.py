@@ -1,17 +1,22 @@
-"""Find instances by a phrase: attributes, a noun and relations to other instances; see `grammar`."""
+"""Find instances by a question: attributes, a noun, relations, counts, orders; see `finding.grammar`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from list3r.memory.description.words import vocabulary
-from list3r.memory.errors import OptionError
+from list3r.memory.description.words import adjectives, kind_word, split_words, vocabulary
+from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
+from list3r.queries.changes import changes
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.finding.grammar import SIZES, SUPERLATIVES, Phrase, parse
+from list3r.queries.finding.grammar import Phrase, Question, parse
+from list3r.queries.finding.naming import SYNONYM, called, looser, name_score, tiers, why_named
+from list3r.queries.finding.ordering import ordered, sized
 from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
 from list3r.queries.finding.words import STRUCTURE, no_such_words
 from list3r.queries.match import Match, Matches, checked_count, checked_instance, of_one_state
@@ -20,8 +25,11 @@ from list3r.queries.views.gather import Gathered, gather, is_large, sample
 
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
-_ALIKE = 0.1
-"""Sizes that differ by less than this share are equally the biggest."""
+_LOOK = 0.8
+"""Most that likeness to words counts."""
+_MOST_LABELLED = 1_000
+"""Instances with all words of a question that are looked at for their label."""
+_HOLDING = ("on", "in", "attached_to")
 
 
 class Found(Matches):
@@ -37,66 +45,208 @@ class Found(Matches):
         super().__init__(matches, notes, total)
         self.unknown_words = tuple(dict.fromkeys(unknown_words))
         """Words that no instance of the memory has."""
+        self.exact = True
+        """False where nothing fits, and the matches are only the nearest by meaning or look."""
+        self.counted: int | None = None
+        """How many there are, for a question that asks so."""
+        self.answer: str | None = None
+        """yes or no, for a question that asks so; None too where the memory cannot know it."""
+        self.mentioned: dict[int, float] = {}
+        """Ids of all that the question names, the table of "mug on the table" too, with how well."""
 
     @property
     def ambiguous(self) -> bool:
         """Whether the second answer is as good as the first."""
         return len(self) > 1 and self[0].score - self[1].score < _EQUAL
 
+    def facts(self) -> dict[str, object]:
+        """Return what is said of the answer as a whole, for machines."""
+        return {
+            "total": self.total,
+            "count": self.counted,
+            "answer": self.answer,
+            "exact": self.exact,
+            "ambiguous": self.ambiguous,
+            "unknown_words": self.unknown_words,
+        }
+
 
 @of_one_state
 def find(
     store: Store, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> Found:
-    """Find the instances that a text describes, the best first: "white mug on table", "chair next to 12".
+    """Answer a question: "white mug on table", "how many chairs are there?", "where did I leave the remote control?".
 
-    Every word must occur in the label, kind of structure, description or colour; small and large are relative to the
-    other instances of the kind; every relation must hold. Without a match the answer is empty, never a guess: its
-    `notes` name the words that no instance has and the relations that the memory cannot know. Left, right, front and
-    behind are judged from `viewpoint` (see `relations.Place`), otherwise in the picture that shows the other instance
-    best. With an `encoder` of a space that the memory holds, phrases with words that no instance has are compared by
-    their vectors. The score is how well the words match times how sure the relations are. Raises `OptionError` for a
-    text without sense and `UnknownIdError` for a number that was never an id.
+    A name is matched with labels first, then by other names of the same thing, then by kinds of it, then by use; only
+    the first of these that names anything counts, and `reason` says which. Small and large are relative to the other
+    instances of the kind; every relation must hold. Where nothing fits, the nearest by meaning, or with an `encoder` of
+    a space that the memory holds by look, come back with a low score, and `exact` is False; the `notes` name the words
+    that no instance has and the relations that the memory cannot know. Left, right, front and behind are judged from
+    `viewpoint` (see `relations.Place`) or from where the question says, otherwise in the picture that shows the other
+    instance best. The score is how well the words match times how sure the relations are. Raises `OptionError` for a
+    text without a letter or digit.
     """
     k = checked_count(k)
-    phrase = parse(text)
-    if viewpoint is None and (of_words := _by_words_alone(store, phrase, k)) is not None:
-        return of_words
-    found, search = meant(store, phrase, viewpoint, encoder)
-    matches = [
-        Match(c.instance, round(c.score, 4), None, None, "; ".join(c.reasons) or "any instance") for c in found[:k]
-    ]
-    out = Found(matches, search.notes, search.unknown, len(found))
-    if out.ambiguous and len(found) > 1:
-        equal = sum(c.score > found[0].score - _EQUAL for c in found)
-        out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
+    question = parse(text)
+    if viewpoint is not None:
+        viewer_from(store, viewpoint)
+    found = _by_words_alone(store, question, k) if viewpoint is None else None
+    if found is None:
+        found = _labelled(store, question, k) or _asked(store, question, k, viewpoint, encoder)
+    if question.kind == "count":
+        found.counted = found.total if found.exact else 0
+    if question.kind == "where" and found.exact:
+        found[:] = [_placed(store, m) for m in found]
+    found.mentioned |= {m.instance.id: m.score for m in found}
+    found.notes = tuple(dict.fromkeys((*found.notes, *question.notes)))
+    return found
+
+
+def _labelled(store: Store, question: Question, k: int) -> Found | None:
+    """Return what bears the whole text as its label, where the text could mean more than a name: "left shoe"."""
+    words = split_words(question.text)
+    if question.kind != "which" or len(words) < 2 or question.phrases == (_plain(question.phrases[0]),):
+        return None
+    bearing = store.instances.of(store.words.bearing(words, _MOST_LABELLED)[0].tolist())
+    named = [i for i in bearing if i.state != "removed" and split_words(i.label or "") == words]
+    matches = [Match(i, 1.0, None, None, f"named {i.label}") for i in named[:k]]
+    return Found(matches, (), (), len(named)) if named else None
+
+
+def _plain(phrase: Phrase) -> Phrase:
+    """Return what a phrase is without relations, sizes, orders and uses."""
+    return Phrase(phrase.text, phrase.words, phrase.noun, phrase.meant)
+
+
+def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, encoder: WordEncoder | None) -> Found:
+    notes: list[str] = []
+    unknown: list[str] = []
+    mentioned: dict[int, float] = {}
+    if question.seen_from is not None and viewpoint is None:
+        seen_from, _ = meant(store, question.seen_from)
+        viewpoint = seen_from[0].instance.id if seen_from else None
+        if not seen_from:
+            notes.append(f"no instance matches {question.seen_from.text!r} to look from")
+    best: dict[int, PhraseMatch] = {}
+    fits: list[bool] = []
+    undecided = by_look = False
+    order = question.phrases[0].order if all(p.order is None for p in question.phrases[1:]) else None
+    shared = order if len(question.phrases) > 1 else None
+    for phrase in question.phrases:
+        asked = replace(phrase, order=None) if shared else phrase
+        found, search = meant(store, asked, viewpoint, encoder)
+        fits.append(_fits(store, question, phrase, len(found)) and not search.by_look)
+        strange = phrase.meant and any(w in search.unknown and w not in adjectives() for w in phrase.words)
+        undecided, by_look = undecided or search.undecided or bool(strange), by_look or search.by_look
+        notes += search.notes
+        unknown += search.unknown
+        mentioned |= search.mentioned
+        for c in found:
+            if c.instance.id not in best or best[c.instance.id].score < c.score:
+                best[c.instance.id] = c
+    if shared is not None and best:  # which is larger, the sofa or the armchair
+        best = {c.instance.id: c for c in ordered(search, list(best.values()), shared, [])}
+    exact = bool(best) and not by_look
+    if not any(_says_something(p) for p in question.phrases) and question.kind == "which":
+        return Found((), ["say what to look for, such as: white mug on table"])
+    if not best:
+        best = _nearest_by_meaning(store, question, encoder)
+    ranked = sorted(best.values(), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
+    matches = [Match(c.instance, round(c.score, 4), None, None, _reason(c)) for c in ranked[:k]]
+    out = Found(matches, notes, unknown, len(ranked))
+    out.exact, out.mentioned = exact, mentioned
+    if question.kind == "exists":
+        yes = all(fits) if question.every else any(fits)
+        out.answer = "yes" if yes else None if undecided else "no"
+    if len(ranked) > 1 and exact:
+        equal = sum(c.score > ranked[0].score - _EQUAL for c in ranked)
+        if equal > 1 and out.ambiguous and question.kind != "count":
+            out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
+    if not exact and ranked:
+        out.notes = (*out.notes, "nothing fits; these are the nearest by " + ("look" if by_look else "meaning"))
     return out
 
 
-def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
+def _fits(store: Store, question: Question, phrase: Phrase, count: int) -> bool:
+    """Whether so many are enough for a yes."""
+    if question.all_of and phrase.noun:
+        return count == len(meant(store, Phrase(phrase.text, (), phrase.noun, phrase.meant))[0]) > 0
+    return question.at_least <= count and (question.at_most is None or count <= question.at_most)
+
+
+def _says_something(phrase: Phrase) -> bool:
+    return phrase != Phrase("anything")
+
+
+def _reason(c: PhraseMatch) -> str:
+    return "; ".join(r for r in c.reasons if r) or "any instance"
+
+
+def _placed(store: Store, m: Match) -> Match:
+    """Return a match whose reason tells what holds it and when it was seen last."""
+    i = m.instance
+    held = [r for r in store.relations.all(i.id, None, None) if r.predicate in _HOLDING]
+    parts = [m.reason]
+    if held:
+        best = max(held, key=lambda r: r.confidence)
+        o = store.instances.get(best.object)
+        parts.append(f"{best.predicate.replace('_', ' ')} #{o.id} {o.label or o.description}")
+    if i.best_view is not None:
+        parts.append(f"last seen at {i.last_seen_s:.1f} s")
+    return replace(m, reason="; ".join(parts))
+
+
+def _nearest_by_meaning(store: Store, question: Question, encoder: WordEncoder | None) -> dict[int, PhraseMatch]:
+    """Return the nearest to what was asked for where nothing fits, with scores that say so."""
+    for phrase in question.phrases:
+        for other, score, why in looser(phrase):
+            found, search = meant(store, other, None, encoder)
+            if found and not search.by_look:
+                return {c.instance.id: PhraseMatch(c.instance, c.score * score, (*c.reasons, why)) for c in found}
+    return {}
+
+
+def _by_words_alone(store: Store, question: Question, k: int) -> Found | None:
     """Return what words alone name in a large memory, of which only the answers are read; None for all other
     questions, and where no instance has the words.
     """
-    words, more = phrase.words, (phrase.where, phrase.size, phrase.superlative)
-    if not words or any(more) or phrase.instance_id is not None or not is_large(store):
+    phrase = question.phrases[0]
+    if question.kind != "which" or question.phrases != (_plain(phrase),) or phrase.generic or not is_large(store):
         return None
+    if len(phrase.meant) > 1:
+        return None
+    words = (*phrase.words, *map(kind_word, phrase.meant)) if phrase.meant else phrase.all_words
     gathered = Gathered(store)
     ids, hundredths = gathered.named(words)
     total = dict(zip(ids.tolist(), hundredths.tolist(), strict=True))
     ranks = store.instances.ranks(ids)
     ranks = ranks.among(~ranks.removed)
-    if STRUCTURE.isdisjoint(words) and not ranks.structure.all():
+    if STRUCTURE.isdisjoint(phrase.all_words) and not ranks.structure.all():
         ranks = ranks.among(~ranks.structure)
     if len(ranks.ids) == 0:
         return None
-    scores = np.array([total[n] for n in ranks.ids.tolist()]) / (100 * len(words))
+    spent = np.array([total[n] for n in ranks.ids.tolist()])
+    if phrase.meant:
+        spent = spent - _of_other_names(gathered, phrase, ranks.ids)
+    scores = spent / (100 * len(words))
     order = np.lexsort((ranks.ids, -ranks.confidence, -scores))[:k]
     best = store.instances.of(ranks.ids[order].tolist())
     score = dict(zip(ranks.ids[order].tolist(), scores[order].tolist(), strict=True))
-    matches = [Match(i, round(score[i.id], 4), None, None, f"named {' '.join(words)}") for i in best]
+    matches = [Match(i, round(score[i.id], 4), None, None, why_named(phrase, i, kind=False)) for i in best]
     equal = int((scores > scores.max() - _EQUAL).sum())
     notes = [f"{equal} instances match equally well; add words to tell them apart"] if equal > 1 and k > 1 else []
     return Found(matches, (*gathered.notes, *notes), (), len(ranks.ids))
+
+
+def _of_other_names(gathered: Gathered, phrase: Phrase, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the hundredths by which those are worse that are named by another word of the same meaning."""
+    key = kind_word(phrase.meant[0])
+    by_name, (known, weight) = gathered.bearers((*phrase.noun, key))[0], gathered.bearers((key,))
+    if len(by_name) == len(known):
+        return np.zeros(len(ids), np.int64)
+    order = np.argsort(known)
+    named = weight[order][np.searchsorted(known[order], ids)].astype(np.int64)
+    return np.where(np.isin(ids, by_name), 0, np.maximum(0, named - round(100 * SYNONYM)))
 
 
 # ---------------------------------------------------------------------------------------------- phrases
@@ -105,12 +255,10 @@ def _by_words_alone(store: Store, phrase: Phrase, k: int) -> Found | None:
 def meant(
     store: Store, phrase: Phrase, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> tuple[list[PhraseMatch], PhraseSearch]:
-    """Return all that a phrase may mean, the best first, and the search with its notes and unknown words."""
-    if viewpoint is not None:
-        viewer_from(store, viewpoint)
+    """Return all that a phrase means, the best first, and the search with its notes and unknown words."""
     gathered = gather(store, phrase)
     loaded = store.instances.all() if gathered is None else store.instances.of(sorted(gathered.ids))
-    things = {i.id: i for i in loaded if i.state != "removed"}
+    things = {i.id: i for i in loaded if i.state != "removed" or phrase.change}
     search = PhraseSearch(store, things, {n: _vocabulary(i) for n, i in things.items()}, encoder, viewpoint, gathered)
     search.notes += [] if gathered is None else gathered.notes
     found = sorted(_meaning(search, phrase), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
@@ -118,17 +266,12 @@ def meant(
 
 
 def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
-    """Return what a phrase may mean: words, then relations, then size among what is left."""
-    if phrase.instance_id is not None:
-        i = checked_instance(search.store, phrase.instance_id)
-        found = [PhraseMatch(i, 1.0, (f"#{i.id}",))]
-        if not _bears(search, i.id, phrase.words):
-            search.notes.append(f"#{i.id} is not named {' '.join(phrase.words)}")
-            found = []
-    else:
-        found = _named(search, phrase)
+    """Return what a phrase means: words, then relations, then size and order among what is left."""
+    found = _numbered(search, phrase) if phrase.instance_id is not None else _named(search, phrase)
+    if phrase.change is not None:
+        found = _changed(search, found, phrase.change)
     if phrase.size is not None:
-        found = _sized(search, found, phrase)
+        found = sized(search, found, phrase)
     for clause in phrase.where:
         if not found:
             # The rest is searched all the same, so that all words without a match are named.
@@ -137,10 +280,43 @@ def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
                 _meaning(search, clause.other)
             continue
         ends = _meaning(search, clause.object), _meaning(search, clause.other) if clause.other else []
-        found = related(search, found, clause, ends, phrase.text)
-    if phrase.superlative is not None and found:
-        found = _extreme(found, phrase.superlative)
+        if not clause.negated:
+            found = related(search, found, clause, ends, phrase.text)
+            continue
+        hit = related(search, found, clause, ends, phrase.text, silent=True) if clause.predicates else ends[0]
+        gone = {c.instance.id for c in hit}
+        found = [
+            PhraseMatch(c.instance, c.score, (*c.reasons, f"not {clause.object.text}"))
+            for c in found
+            if c.instance.id not in gone
+        ]
+    if phrase.order is not None and found:
+        to = _meaning(search, phrase.order.to) if phrase.order.to is not None else []
+        found = ordered(search, found, phrase.order, to)
     return found
+
+
+def _numbered(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
+    """Return the instance of a number, if it bears the words too."""
+    try:
+        i = checked_instance(search.store, phrase.instance_id or 0)
+    except UnknownIdError as error:
+        search.notes.append(str(error))
+        return []
+    if not _bears(search, i.id, phrase.all_words):
+        search.notes.append(f"#{i.id} is not named {' '.join(phrase.all_words)}")
+        return []
+    return [PhraseMatch(i, 1.0, (f"#{i.id}",))]
+
+
+def _changed(search: PhraseSearch, found: list[PhraseMatch], kind: str) -> list[PhraseMatch]:
+    """Return those that a session showed to have changed so, the newest change of each."""
+    kinds = ("moved", "removed", "added") if kind == "changed" else (kind,)
+    newest = {c.instance.id: c for c in reversed(changes(search.store, None, kinds))}
+    out = [(c, newest[c.instance.id]) for c in found if c.instance.id in newest]
+    if not out:
+        search.notes.append(f"no session shows that anything of this was {kind}")
+    return [PhraseMatch(c.instance, c.score * e.score, (*c.reasons, f"{e.event.kind}: {e.reason}")) for c, e in out]
 
 
 def _vocabulary(i: Instance) -> dict[str, float]:
@@ -149,36 +325,67 @@ def _vocabulary(i: Instance) -> dict[str, float]:
 
 
 def _named(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
-    unknown = _unknown(search, phrase.words)
+    """Return what has the words of a phrase, by the first of its meanings that names anything."""
+    unknown = _unknown(search, phrase)
     if unknown:
         by_vector = _by_vector(search, phrase)
         if by_vector is not None:
+            search.by_look = True
             return by_vector
         search.unknown += unknown
         named = search.things.values() if search.gathered is None else sample(search.store)
         search.notes.append(no_such_words(unknown, named))
         return []
-    structure = not STRUCTURE.isdisjoint(phrase.words) or bool(
-        phrase.words
-        and not any(_bears(search, n, phrase.words) for n, i in search.things.items() if i.structure is None)
-    )
-    out = []
-    for n, i in search.things.items():
-        if (i.structure is None or structure) and _bears(search, n, phrase.words):
-            score = sum(search.vocabulary[n][w] for w in phrase.words) / len(phrase.words) if phrase.words else 1.0
-            reasons = (f"named {' '.join(phrase.words)}",) if phrase.words else ()
-            out.append(PhraseMatch(i, score, reasons))
-    if not out and len(phrase.words) > 1:
-        search.notes.append("no instance matches all of the words " + ", ".join(repr(w) for w in phrase.words))
-    return out
+    bound = not STRUCTURE.isdisjoint((*phrase.all_words, *phrase.meant))
+    if phrase.generic:
+        things = [i for i in search.things.values() if not _bounds(i)]
+        return [PhraseMatch(i, 1.0) for i in things]
+    for nouns in tiers(phrase):
+        out = []
+        for n, i in search.things.items():
+            score = _score(search, n, phrase, nouns)
+            if score > 0.0:
+                out.append(PhraseMatch(i, score, (why_named(phrase, i, kind=nouns != phrase.meant),)))
+        kept = [c for c in out if bound or not _bounds(c.instance)]
+        if kept or out:
+            search.mentioned |= {c.instance.id: c.score for c in kept or out}
+            return kept or out
+    if phrase.use is not None:
+        search.notes.append(f"no instance is known to be for this: {phrase.use}")
+    elif len(phrase.all_words) > 1:
+        said = ", ".join(repr(w) for w in phrase.all_words)
+        search.notes.append(f"no instance matches all of the words {said}")
+    return []
 
 
-def _unknown(search: PhraseSearch, words: Sequence[str]) -> list[str]:
+def _score(search: PhraseSearch, n: int, phrase: Phrase, nouns: tuple[str, ...]) -> float:
+    """Return the mean of how well each word, and the name, fit an instance; 0 where one does not."""
+    vocabulary = search.vocabulary[n]
+    if not phrase.meant:
+        return _mean([vocabulary.get(w, 0.0) for w in phrase.all_words])
+    return _mean([*(vocabulary.get(w, 0.0) for w in phrase.words), name_score(phrase, vocabulary, nouns)])
+
+
+def _mean(scores: list[float]) -> float:
+    return sum(scores) / len(scores) if min(scores) > 0.0 else 0.0
+
+
+def _bounds(i: Instance) -> bool:
+    """Whether it bounds the room, as structure or by its label."""
+    return i.structure is not None or not STRUCTURE.isdisjoint(called(i))
+
+
+def _unknown(search: PhraseSearch, phrase: Phrase) -> list[str]:
     """Return words that no instance has."""
+    keys = [kind_word(n) for nouns in tiers(phrase) for n in nouns]
+    words = phrase.words if phrase.meant else phrase.all_words
     if search.gathered is not None:
-        known = search.store.words.known(words)
-        return [w for w in words if w not in known]
-    return [w for w in words if not any(w in v for v in search.vocabulary.values())]
+        known = search.store.words.known((*words, *keys))
+    else:
+        wanted = {*words, *keys}
+        known = {w for v in search.vocabulary.values() for w in wanted & v.keys()}
+    out = [w for w in words if w not in known]
+    return out + (list(phrase.noun) if phrase.noun and keys and known.isdisjoint(keys) else [])
 
 
 def _bears(search: PhraseSearch, n: int, words: Sequence[str]) -> bool:
@@ -190,7 +397,7 @@ def _by_vector(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch] | None
     there."""
     if search.encoder is None:
         return None
-    text = " ".join(phrase.words)
+    text = " ".join(phrase.all_words)
     try:
         cosine = named_by_vectors(search.store, search.encoder, text)
     except OptionError as error:  # the memory has come to a machine without the model's weights
@@ -201,7 +408,7 @@ def _by_vector(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch] | None
     if search.gathered is not None:
         _look_at_too(search, list(cosine))
     return [
-        PhraseMatch(search.things[n], c, (like(text, c, search.encoder.space),))
+        PhraseMatch(search.things[n], min(c, _LOOK), (like(text, c, search.encoder.space),))
         for n, c in cosine.items()
         if n in search.things and search.things[n].structure is None
     ]
@@ -211,48 +418,3 @@ def _look_at_too(search: PhraseSearch, ids: Sequence[int]) -> None:
     fresh = search.store.instances.of([n for n in ids if n not in search.things])
     for i in (i for i in fresh if i.state != "removed"):
         search.things[i.id], search.vocabulary[i.id] = i, _vocabulary(i)
-
-
-# ---------------------------------------------------------------------------------------------- sizes
-
-
-def _sized(search: PhraseSearch, found: list[PhraseMatch], phrase: Phrase) -> list[PhraseMatch]:
-    """Return those of a size, relative to the others that fit the words, or to all things where those are fewer than
-    four."""
-    size = phrase.size
-    assert size is not None
-    edges = np.array([]) if search.gathered is None else search.gathered.sizes_of(phrase.words)
-    if len(edges) == 0:
-        among = [c.instance for c in found]
-        if len(among) < 4:
-            among = [i for i in search.things.values() if i.structure is None] or among
-        edges = np.sort([_edge(i) for i in among])
-    low, high = SIZES[size]
-    out = []
-    for c in found:
-        rank = float(np.mean(edges < _edge(c.instance)) + 0.5 * np.mean(edges == _edge(c.instance)))
-        weight = search.vocabulary[c.instance.id].get(size, 0.0)
-        fit = 1.0 - rank if high <= 0.5 else rank if low >= 0.5 else 1.0 - 2.0 * abs(rank - 0.5)
-        if weight > 0.0 or low <= rank <= high:
-            score = max(weight, 0.5 + 0.5 * fit)
-            why = f"{size}: longest edge {_edge(c.instance):.2f}, {1.0 - rank:.0%} of the others are larger"
-            out.append(PhraseMatch(c.instance, c.score * score, (*c.reasons, why)))
-    return out
-
-
-def _extreme(found: list[PhraseMatch], superlative: str) -> list[PhraseMatch]:
-    """Return the largest or smallest, and what is practically as large."""
-    kind = SUPERLATIVES[superlative]
-    sizes = [_edge(c.instance) if abs(kind) == 1 else float(np.ptp(c.instance.aabb[:, 2])) for c in found]
-    best = max(sizes) if kind > 0 else min(sizes)
-    out = []
-    for c, size in zip(found, sizes, strict=True):
-        share = min(size, best) / max(size, best, 1e-12)
-        if share >= 1.0 - _ALIKE:
-            what = "longest edge" if abs(kind) == 1 else "height"
-            out.append(PhraseMatch(c.instance, c.score * share, (*c.reasons, f"{superlative}: {what} {size:.2f}")))
-    return out
-
-
-def _edge(i: Instance) -> float:
-    return float(np.max(i.box.size))

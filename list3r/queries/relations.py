@@ -12,7 +12,7 @@ from list3r.memory.records import Instance, Relation
 from list3r.memory.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
-from list3r.queries.finding.words import no_such_words, wanted_words, words_of
+from list3r.queries.finding.words import is_named, no_such_words, same_kind, wanted_words
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera
 from list3r.queries.views.gather import is_large, sample
@@ -129,11 +129,12 @@ def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | 
         wanted = set(wanted_words(what))
         if is_large(store):
             found = store.words.bearing(sorted(wanted), _MOST_NAMED + 1)[0].tolist()
+            found = found or store.words.bearing(sorted(map(same_kind, wanted)), _MOST_NAMED + 1)[0].tolist()
             if len(found) > _MOST_NAMED:
                 notes.append(f"more than {_MOST_NAMED} instances match {what!r}; {_MOST_NAMED} of them were considered")
             found = sorted(found[:_MOST_NAMED])
         else:
-            found = [i.id for i in store.instances.all() if wanted <= words_of(i)]
+            found = [i.id for i in store.instances.all() if is_named(i, what)]
         if not found and (unknown := sorted(wanted - store.words.known(wanted))):
             notes.append(no_such_words(unknown, sample(store)))
         return found

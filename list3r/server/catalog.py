@@ -30,7 +30,7 @@ class CatalogTools:
         return page([asdict(e) for e in self._catalog.memories()], "", limit, offset)
 
     def find(self, text: Words, memory: InMemory = None, limit: Limit = 10) -> dict[str, Any]:
-        """The things that a phrase describes, such as "red toolbox" or "mug on table", in one memory or over all."""
+        """Answer a question such as "red toolbox", "mug on table", "how many chairs?", in one memory or over all."""
         return _as_page(self._catalog.find(text, memory, k=limit))
 
     def nearest(
@@ -73,4 +73,4 @@ def _as_page(found: CatalogAnswers, limit: int | None = None) -> dict[str, Any]:
     rows: Sequence[Any] = found if limit is None else found[:limit]
     texts = ("label", "description", "subject_name", "object_name")
     matches = [{k: shown(v) if k in texts and v is not None else v for k, v in asdict(m).items()} for m in rows]
-    return {"total": len(found), "matches": matches, "notes": list(found.notes)}
+    return {"total": len(found), "matches": matches, "notes": list(found.notes), **found.facts()}

@@ -70,13 +70,15 @@ class ReadingTools:
         }
 
     def find(self, text: Words, limit: Limit = 10) -> dict[str, Any]:
-        """The things that a phrase describes, the best first, such as "white mug on the table" or "the biggest chair".
+        """Answer a question in plain words: "white mug on the table", "where is the remote?", "something to sit on",
+        "chair closest to the door", "second book from the left", "lamp that is not on the desk", "what moved?".
 
-        An empty answer means that nothing fits; `notes` name the words that describe nothing.
+        `count` answers "how many ...?", `answer` is yes or no for "is there ...?". Names may be synonyms, broader
+        words, or German, French, Spanish, Italian, Japanese or Chinese. `exact` false: nothing fits, and the matches
+        are only the nearest by meaning or look. `notes` name the words that describe nothing.
         """
         found = self._memory.find(text, limit)
-        result = {"total": found.total, "ambiguous": found.ambiguous, "unknown_words": list(found.unknown_words)}
-        return {**self._matches(found, found.notes), **result}
+        return {**self._matches(found, found.notes), **found.facts(), "unknown_words": list(found.unknown_words)}
 
     def nearest(
         self,

@@ -154,7 +154,7 @@ class _Questions:
     def find(self, text: Text, page: Paged, which: Filtered, memory: Maybe = None) -> dict[str, Any]:
         """Things by a phrase, in one memory or over all."""
         found = self._catalog.find(text, memory, k=self._wanted(page), filters=which.filters())
-        return self._paged(found, page, found.notes)
+        return self._paged(found, page, found.notes, **found.facts())
 
     def nearest(
         self, name: str, page: Paged, which: Filtered, at: Annotated[Point, Depends()], id: InstanceId = None

@@ -159,7 +159,8 @@ class Viewer:
         """Search, select the best answer and look at it; the ids that answer. The panel says what was not found."""
         found = self.memory.find(text, 10)
         ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
-        self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join(found.notes))
+        said = [str(x) for x in (found.counted, found.answer) if x is not None]
+        self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join([*said, *found.notes]))
         if ids:
             self.select(ids[0], look=True)
         return ids

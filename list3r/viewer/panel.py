@@ -79,7 +79,7 @@ class Panel:
     # ------------------------------------------------------------------ controls
 
     def _search(self) -> None:
-        text = self._gui.add_text("Find", "", hint="white mug on table; the biggest chair; 12")
+        text = self._gui.add_text("Find", "", hint="white mug on table; how many chairs?; 12")
         button = self._gui.add_button("Search")
         self._choice: Any = self._gui.add_dropdown("Answers", [_NOTHING], visible=False)
 

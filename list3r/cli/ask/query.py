@@ -108,9 +108,7 @@ def find(
     memory: MemoryArgument,
     text: Annotated[
         str,
-        typer.Argument(
-            metavar="TEXT", help="Description of the thing and its relations to others.", show_default=False
-        ),
+        typer.Argument(metavar="TEXT", help="Question or description, such as: where is the lamp?", show_default=False),
     ],
     k: Count = 5,
     viewpoint: Annotated[
@@ -119,13 +117,15 @@ def find(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """The things that a text describes by attributes, a noun and relations; an id can stand for a thing.
+    """The things that a question is about, how many, or yes or no; an id can stand for a thing.
 
-    Example: list3r query find house.l3r "white mug on table"
+    Example: list3r query find house.l3r "how many chairs are next to the table?"
     """
     with open_memory(memory) as scene:
         found, units = scene.find(text, k, viewpoint=viewpoint), scene.units
-    print_matches(found, units, json, ambiguous=found.ambiguous, unknown_words=found.unknown_words)
+    if not json and (found.counted is not None or found.answer is not None):
+        say(str(found.counted) if found.counted is not None else str(found.answer))
+    print_matches(found, units, json, **found.facts())
 
 
 def seen(

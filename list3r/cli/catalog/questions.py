@@ -13,7 +13,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.common import asked_at, in_column, parse_point, print_table
-from list3r.cli.terminal import note
+from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
     from list3r.catalog import Catalog
@@ -173,7 +173,9 @@ def _print(
     rows: list[Any], found: CatalogAnswers, json: bool, row: Callable[[Any], list[object]], header: tuple[str, ...]
 ) -> None:
     if json:
-        print_answer(map(asdict, rows), None, found.notes)
+        print_answer(map(asdict, rows), None, found.notes, **found.facts())
         return
+    for said in found.facts().values():
+        say(str(said))
     note(*(f"note: {line}" for line in found.notes))
     print_table(map(row, rows), header)

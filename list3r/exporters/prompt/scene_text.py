@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -65,13 +65,16 @@ def scene_prompt(
     """Return the text of a memory in at most this many tokens, see `SceneMemory.prompt`."""
     settings = settings or PromptSettings()
     things = [i for i in memory.instances(structure=None) if i.state != "removed"]
-    ranked = ranked_instances(memory, things, question)
+    found = None if not question else memory.find(question, 200)
+    ranked = ranked_instances(things, question or "", {} if found is None else found.mentioned)
     budget = Budget(tokens)
     writer = _SceneWriter(memory, things, settings)
     for line in writer.head():
         if not budget.add(line):
             needed = sum(_cost(x) for x in writer.head())
             raise OptionError(f"{tokens} tokens are too few: the head of the text alone takes {needed}; allow more")
+    if found is not None and not (found and found.exact):
+        budget.add(_unresolved(question or "", found.unknown_words))
     listed = writer.rows(budget, ranked)
     if len(listed) < len(things):
         writer.counts(budget, [name_of(i) for i in listed] if question else [])
@@ -87,14 +90,23 @@ def _cost(line: str) -> int:
     return budget.used
 
 
-def ranked_instances(memory: SceneMemory, things: Sequence[Instance], question: str | None) -> list[Instance]:
-    """Return the instances in the order in which they matter: by the words of a question and ids such as #12 in it,
-    then by nearness to what it names; without a question the surest and most seen things first, structure last.
+def _unresolved(question: str, unknown: Sequence[str]) -> str:
+    """Say what of a question the memory does not know."""
+    words = f"no thing is known as {', '.join(map(repr, unknown))}" if unknown else "no thing fits all of it"
+    return shown(f"Question {question[:80]!r}: {words}.")
+
+
+def ranked_instances(
+    things: Sequence[Instance], question: str = "", mentioned: Mapping[int, float] | None = None
+) -> list[Instance]:
+    """Return the instances in the order in which they matter: those `mentioned` in a question, by how well it names
+    them, and ids such as #12 in it, then by nearness to these; without a question the surest and most seen things
+    first, structure last.
     """
     usual = sorted(things, key=lambda i: (i.structure is not None, -i.confidence * np.log1p(i.observations), i.id))
     if not question:
         return usual
-    named = {m.instance.id: m.score for m in memory.nearest(question, k=200)}
+    named = dict(mentioned or {})
     written = {int(n) for n in re.findall(r"#(\d+)\b", question)}
     named |= {i.id: 2.0 for i in things if i.id in written}
     if not named:

@@ -98,7 +98,8 @@ MIGRATIONS: tuple[str, ...] = (
         position_sigma_m REAL CHECK (position_sigma_m >= 0)) STRICT;
     CREATE VIRTUAL TABLE instance_boxes USING rtree (id, min_x, max_x, min_y, max_y, min_z, max_z);
     CREATE VIRTUAL TABLE words USING fts5 (
-        w100, w90, w80, content='', contentless_delete=1, detail=column, tokenize='unicode61 remove_diacritics 0');
+        w100, w98, w90, w80, content='', contentless_delete=1, detail=column,
+        tokenize="unicode61 remove_diacritics 0 tokenchars '_'");
     CREATE TABLE observations (
         chunk_id INTEGER NOT NULL REFERENCES chunks, local_id INTEGER NOT NULL,
         instance INTEGER NOT NULL REFERENCES instances, PRIMARY KEY (chunk_id, local_id),

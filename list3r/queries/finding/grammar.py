@@ -1,82 +1,62 @@
-"""The grammar of `find`: [attributes] noun [relation [attributes] noun [relation ...]].
+"""The grammar of `find`: a question as people ask it, read into a frozen `Question`.
 
-    white mug on table          chair next to 12          the biggest red thing near the door
-    small box in the cabinet    mugs left of the laptop   lamp between 4 and the sofa
+    white mug on table              where did I leave the remote control?     something to sit on
+    how many chairs are there?      is there a lamp on the desk?              chair closest to the door
+    second chair from the left      the chair that is not brown               plates and forks on the table
+    lamp between 4 and the sofa     what is left of the sofa seen from the door?
 
-A phrase is what stands before, between and after relations: words that a thing must bear, words of size, and the
-number of an instance instead of all that. Relations bind to the right: in "mug on the table near the door" the table
-is the one near the door; "and" binds what follows to the first thing again: "mug on the table and next to 12".
+First words become tokens, see `tokens`. Then `_Reader` reads: a question is phrases joined by "and" or "or", then
+clauses; a phrase is attributes, a noun, an order ("largest", "second from the left"), a use, or the number of an
+instance. Clauses bind to the right: in "mug on the table near the door" the table is near the door; after "and" they
+bind to the first again.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+import string
+from dataclasses import dataclass, replace
 
-from list3r.memory.description.words import split_words
+from list3r.memory.description.nouns import is_a
+from list3r.memory.description.words import adjectives, split_words
 from list3r.memory.errors import OptionError
-
-RELATIONS: dict[str, tuple[str, ...]] = {
-    "on top of": ("on",),
-    "hanging on": ("attached_to",),
-    "mounted on": ("attached_to",),
-    "attached to": ("attached_to",),
-    "fixed to": ("attached_to",),
-    "sitting on": ("on",),
-    "standing on": ("on",),
-    "lying on": ("on",),
-    "on": ("on", "attached_to"),
-    "upon": ("on",),
-    "at": ("on", "attached_to", "next_to", "near"),
-    "inside of": ("in",),
-    "inside": ("in",),
-    "into": ("in",),
-    "in": ("in",),
-    "under": ("under", "below"),
-    "underneath": ("under", "below"),
-    "beneath": ("under", "below"),
-    "below": ("under", "below"),
-    "above": ("above",),
-    "over": ("above",),
-    "next to": ("next_to",),
-    "adjacent to": ("next_to",),
-    "beside": ("next_to",),
-    "alongside": ("next_to",),
-    "close to": ("next_to", "near"),
-    "near to": ("next_to", "near"),
-    "near": ("next_to", "near"),
-    "nearby": ("next_to", "near"),
-    "by": ("next_to", "near"),
-    "supporting": ("supports",),
-    "supports": ("supports",),
-    "contains": ("contains",),
-    "carrying": ("supports",),
-    "containing": ("contains",),
-    "with": ("supports", "contains"),
-    "to the left of": ("left_of",),
-    "left of": ("left_of",),
-    "to the right of": ("right_of",),
-    "right of": ("right_of",),
-    "in front of": ("in_front_of",),
-    "behind": ("behind",),
-    "between": ("between",),
-}
-"""What people say, and the predicates that it may mean."""
-_PHRASES: dict[tuple[str, ...], tuple[str, ...]] = {tuple(text.split()): meant for text, meant in RELATIONS.items()}
-_LONGEST = max(len(p) for p in _PHRASES)
-
-GENERIC = frozenset("thing object item something anything everything stuff one what which".split())
-"""Words that name nothing in particular."""
-_FILLERS = frozenset(
-    "a an the my your our this that these those some any all is are of find show me please there".split()
+from list3r.queries.finding.tokens import (
+    ENDS,
+    LONGEST,
+    Token,
+    opening,
+    openings,
+    table,
+    text_words,
+    tokens_of,
+    use_at,
 )
-_VERBS = frozenset("standing sitting lying placed located stands sits lies".split())
 
-SIZES = {"tiny": (0.0, 0.25), "small": (0.0, 0.5), "medium": (0.2, 0.8), "large": (0.5, 1.0), "huge": (0.75, 1.0)}
-"""Words of size, and which part they are of what there is, ordered by size."""
-SUPERLATIVES = {"biggest": 1, "largest": 1, "longest": 1, "smallest": -1, "tiniest": -1, "tallest": 2, "shortest": -2}
-"""1 and -1 by the longest edge, 2 and -2 by height."""
+_BOUNDS = {"floor", "wall", "ceiling"}
+"""What bounds a room: what is said after one is seldom said of it."""
+_INVERSE = {
+    "on": ("supports",),
+    "in": ("contains",),
+    "under": ("above",),
+    "above": ("under", "below"),
+    "next to": ("next_to", "near"),
+}
+"""What a thing is to which another stands so: of "what is the cat lying on?"."""
+_SEVERAL = ("with", "supporting", "containing", "next to", "near")
+"""Relations to all of several: "the desk with the laptop and the monitor"."""
 _MOST_WORDS = 64
+_WHERE = ("where", "wo", "où", "dónde", "donde", "dove")
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which of several: "largest", "second from the left", "closest to the door"."""
+
+    by: str
+    """A key of `orders` in phrases.json."""
+    rank: int = 1
+    """Counted from 1; -1 for the last."""
+    to: Phrase | None = None
+    """What `nearest` and `farthest` are measured from."""
 
 
 @dataclass(frozen=True)
@@ -85,101 +65,352 @@ class Phrase:
 
     text: str
     words: tuple[str, ...] = ()
-    """What it must bear, singular and in the words of `words`."""
+    """What it must bear beside its name, as `split_words` has them."""
+    noun: tuple[str, ...] = ()
+    """The words that name it, as `split_words` has them."""
+    meant: tuple[str, ...] = ()
+    """The nouns of the table that those words mean; empty for a name that is not in it."""
+    use: str | None = None
+    """What one does with it."""
     size: str | None = None
-    superlative: str | None = None
+    order: Order | None = None
     instance_id: int | None = None
     where: tuple[Clause, ...] = ()
     """How it stands to others; all must hold."""
+    change: str | None = None
+    """moved, removed, added or changed."""
+
+    @property
+    def all_words(self) -> tuple[str, ...]:
+        """Attributes and name."""
+        return tuple(dict.fromkeys((*self.words, *self.noun)))
+
+    @property
+    def ellipsis(self) -> bool:
+        """Whether its noun is left out: "the red one"."""
+        return not self.noun and self.text.split()[-1:] in (["one"], ["ones"])
+
+    @property
+    def generic(self) -> bool:
+        """Whether it names nothing in particular."""
+        return not (self.words or self.noun or self.use or self.instance_id is not None)
 
 
 @dataclass(frozen=True)
 class Clause:
-    """A relation to something."""
+    """A relation to something, or what something is not: then there are no predicates."""
 
     wording: str
     predicates: tuple[str, ...]
     object: Phrase
     other: Phrase | None = None
     """The second of two, for between."""
+    negated: bool = False
+    either: bool = False
+    """Whether it holds or the one before it."""
 
 
-def parse(text: str) -> Phrase:
-    """Parse a question. Raises `OptionError` for one that is empty, too long, or ends in a relation."""
-    tokens = re.findall(r"#?[0-9]+(?![^\W_])|[^\W_]+", text.lower())  # names of predicates (next_to) come apart
-    if not tokens:
+@dataclass(frozen=True)
+class Question:
+    """What is asked."""
+
+    text: str
+    kind: str
+    """which, where, count or exists."""
+    phrases: tuple[Phrase, ...]
+    """What is asked for: what any of them means answers."""
+    every: bool = False
+    """Whether all of the phrases must be there for a yes."""
+    all_of: bool = False
+    """Whether a yes needs all that have the name: "are all chairs brown?"."""
+    at_least: int = 1
+    """How many must be there for a yes,"""
+    at_most: int | None = None
+    """and how many may be; None for any number."""
+    seen_from: Phrase | None = None
+    notes: tuple[str, ...] = ()
+
+
+def parse(text: str) -> Question:
+    """Read a question. Raises `OptionError` for a text of spaces and punctuation; anything else is a question."""
+    words = text_words(text)
+    if not text.strip(string.punctuation + string.whitespace):
         raise OptionError(f"{text!r} has no word to search for; ask for something such as: white mug on table")
-    if len(tokens) > _MOST_WORDS:
-        raise OptionError(f"a question of {len(tokens)} words is too long; {_MOST_WORDS} are the most")
-    return _sentence(tokens, text)
+    notes = []
+    if len(words) > _MOST_WORDS:
+        notes.append(f"the question has {len(words)} words; the first {_MOST_WORDS} were read")
+        words = words[:_MOST_WORDS]
+    words, place = _split_off(words, openings("seen_from"))
+    kind, words = _kind(_adjectives_first(_with_its_end(words)))
+    bounds, words = _bounds_of(words) if kind == "exists" else ((1, None), words)
+    tokens = tokens_of(words) or ([Token("word", text, text)] if not text_words(text) else [])
+    if kind == "exists" and len(tokens) > 1 and tokens[-1].kind == "relation":
+        tokens[-1] = Token("word", tokens[-1].text, tokens[-1].text)  # is the lamp on
+    reader = _Reader(tokens)
+    phrases, every = reader.question()
+    seen_from = _Reader(tokens_of(place)).question()[0][0] if place else None
+    if reader.places:
+        notes.append(f"rooms are not told apart: {reader.places[0]!r} was left out")
+    all_of = kind == "exists" and bool({"all", "every", "each", "both"} & set(words))
+    return Question(text, kind, phrases, every, all_of, *bounds, seen_from, tuple(notes))
 
 
-def _sentence(tokens: list[str], text: str) -> Phrase:
-    """Return the first phrase with its clauses; "and" before a relation comes back to it."""
-    start = next((n for n in range(len(tokens)) if _relation_at(tokens, n)[0]), None)
-    head = _phrase(tokens[: start if start is not None else len(tokens)])
-    clauses: list[Clause] = []
-    while start is not None:
-        end = _next_and(tokens, start)
-        clauses.append(_clause(tokens[start:end], text))
-        start = None if end >= len(tokens) else end + 1
-    return Phrase(head.text, head.words, head.size, head.superlative, head.instance_id, tuple(clauses))
+def _bounds_of(words: list[str]) -> tuple[tuple[int, int | None], list[str]]:
+    """Return how many there must and may be for a yes, and the words after that: "more than two plants"."""
+    said = [w for w in words[:4] if w not in ("than", "at", "exactly", "only", "just", "the")]
+    compared = said[0] if said and said[0] in ("more", "fewer", "less", "least", "most") else ""
+    number = table()["numbers"].get(said[bool(compared)], said[bool(compared)]) if len(said) > bool(compared) else ""
+    if not str(number).isdigit() or len(words) < 2:
+        return (1, None), words
+    count, exact = int(number), "exactly" in words[:2]
+    rest = words[words.index(said[bool(compared)]) + 1 :]
+    if compared in ("fewer", "less", "most"):
+        return (0, count - (compared != "most")), rest
+    return (count + (compared == "more"), count if exact else None), rest
 
 
-def _clause(tokens: list[str], text: str) -> Clause:
-    length, predicates = _relation_at(tokens, 0)
-    words, rest = " ".join(tokens[:length]), tokens[length:]
-    if predicates == ("between",):
-        if "and" not in rest:
-            raise OptionError(f"{text!r}: between needs two things, such as: between 4 and the sofa")
-        middle = rest.index("and")
-        one, two = rest[:middle], rest[middle + 1 :]
-    else:
-        one, two = rest, []
-    for part in (one, *([two] if predicates == ("between",) else [])):
-        if not [t for t in part if t not in _FILLERS]:
-            raise OptionError(f"{text!r}: say what it should be {words}, such as: mug {words} table")
-    other = _sentence(two, text) if two else None
-    return Clause(words, predicates, _sentence(one, text), other)
+def _adjectives_first(words: list[str]) -> list[str]:
+    """Return words with what is said of the first thing at the end before it: "things on the desk that are white"."""
+    for k in range(len(words) - 2, 0, -1):
+        if words[k - 1] in ("that", "which") and words[k] in ("is", "are"):
+            last = tokens_of(words[k + 1 :])
+            return [*words[k + 1 :], *words[: k - 1]] if last and all(t.kind == "word" for t in last) else words
+    return words
 
 
-def _phrase(tokens: list[str]) -> Phrase:
-    words: list[str] = []
-    size = superlative = number = None
-    for token in tokens:
-        if re.fullmatch(r"#?[0-9]+", token):
-            number = int(token.removeprefix("#")[:30])
-        elif token in SUPERLATIVES:
-            superlative = token
-        elif token not in _FILLERS and token not in _VERBS and token != "and":
-            word = split_words(token)[0]
-            if word in SIZES:
-                size = word
-            elif word not in GENERIC:
-                words.append(word)
-    rest = " ".join(t for t in tokens if t not in _FILLERS)
-    return Phrase(rest or "anything", tuple(dict.fromkeys(words)), size, superlative, number)
+def _with_its_end(words: list[str]) -> list[str]:
+    """Return words in which "closest" and "farthest" stand before what they are measured from: "seat closest to"."""
+    for k, word in enumerate(words):
+        joined = {"nearest": "to", "closest": "to", "farthest": "from", "furthest": "from"}.get(word)
+        following = words[k + 1 : k + 2]
+        if joined is None or not following or following[0] in ("to", "from", "away"):
+            continue
+        if following[0] in table()["articles"].split():
+            return [*words[: k + 1], joined, *words[k + 1 :]]
+        end = next((n for n in range(k + 2, len(words)) if words[n] in ("to", "from")), None)
+        if end is not None:
+            return [*words[:k], *words[k + 1 : end], word, joined, *words[end + 1 :]]
+    return words
 
 
-def _relation_at(tokens: list[str], k: int) -> tuple[int, tuple[str, ...]]:
-    """Return (how many words, predicates) of the longest relation that begins at a word; 0 words for none."""
-    for length in range(min(_LONGEST, len(tokens) - k), 0, -1):
-        words = tuple(tokens[k : k + length])
-        if words in _PHRASES:
-            return length, _PHRASES[words]
-        without = tuple(t for t in words if t != "the")
-        if length > 1 and without != words and without in _PHRASES and words[0] != "the" and words[-1] != "the":
-            return length, _PHRASES[without]
-    return 0, ()
+def _split_off(words: list[str], marks: frozenset[tuple[str, ...]]) -> tuple[list[str], list[str]]:
+    """Return the words before and after the first of some marks."""
+    for k in range(len(words)):
+        for length in range(LONGEST, 0, -1):
+            if tuple(words[k : k + length]) in marks:
+                return words[:k], words[k + length :]
+    return words, []
 
 
-def _next_and(tokens: list[str], start: int) -> int:
-    """Return where the clause that begins at `start` ends: at an "and" that a relation follows, or at the end."""
-    length, predicates = _relation_at(tokens, start)
-    spared = predicates == ("between",)
-    for n in range(start + length, len(tokens)):
-        if tokens[n] == "and" and spared:
-            spared = False
-        elif tokens[n] == "and" and n + 1 < len(tokens) and _relation_at(tokens, n + 1)[0]:
-            return n
-    return len(tokens)
+def _kind(words: list[str]) -> tuple[str, list[str]]:
+    """Return what kind of question begins so, and the words after its opening."""
+    kind, asked, asks = "which", False, {"counts": "count", "yes_no": "exists", "openers": ""}
+    while words:
+        length, name = max((opening(words, openings(n)), n) for n in asks)
+        if not length or (asks[name] and asked):
+            break
+        if asks[name]:
+            return asks[name], words[length:]
+        asked = asked or words[0] in (*_WHERE, "what", "which")
+        kind = "where" if words[0] in _WHERE else kind
+        if asked and use_at(words, length)[0]:
+            return "which", words[length:]
+        words = words[length:]
+        words = words[1:] if words and words[0] in ("me", "the", "is", "are") and len(words) > 1 else words
+    return kind, words
+
+
+class _Reader:
+    """Reads tokens into phrases and clauses, left to right."""
+
+    def __init__(self, tokens: list[Token]) -> None:
+        self._tokens = tokens
+        self._at = 0
+        self.places: list[str] = []
+        """Rooms that were named."""
+
+    def question(self) -> tuple[tuple[Phrase, ...], bool]:
+        """Return the phrases that answer, and whether all of them are asked for."""
+        if len(self._tokens) > 1 and self._tokens[-1].kind == "relation":
+            others = [t.kind for t in self._tokens[:-1]]
+            if "noun" in others and "relation" not in others and self._tokens[-1].value in _INVERSE:
+                return (self._inverted(),), False
+            self._tokens.pop()
+        heads, every = [self._phrase()], True
+        while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
+            every &= self._take().kind == "and"
+            heads.append(self._phrase())
+        heads = _completed(heads, every=every)
+        clauses = self._clauses(heads[0])
+        if heads[0].text == "anything" and len(clauses) == 1 and not clauses[0].predicates and clauses[0].object.noun:
+            unlike = clauses[0].object  # non-red cushion
+            heads = [replace(unlike, words=())]
+            clauses = (replace(clauses[0], object=Phrase(" ".join(unlike.words), unlike.words)),)
+        while self._next() in ("and", "or") and self._next(1) not in ("relation", "not", ""):
+            self._take()  # mug on the table or bowl on the desk
+            heads[-1] = replace(heads[-1], where=(*heads[-1].where, *clauses))
+            heads.append(self._phrase())
+            clauses = self._clauses(heads[-1])
+            heads[-1], clauses = replace(heads[-1], where=clauses), ()
+        if clauses:
+            heads = [replace(h, where=(*h.where, *clauses)) for h in heads]
+        return tuple(p for h in heads for p in _alternatives(h)), every and len(heads) > 1
+
+    def _inverted(self) -> Phrase:
+        """Return what something else stands to as is said last: "what is the cat lying on"."""
+        relation = self._tokens.pop()
+        things = [t for t in self._tokens if t.kind != "thing"]
+        subject = _Reader(things or self._tokens).question()[0][0]
+        predicates = _INVERSE[relation.value]
+        return Phrase("anything", where=(Clause(f"with something {relation.text}", predicates, subject),))
+
+    def _next(self, ahead: int = 0) -> str:
+        at = self._at + ahead
+        return self._tokens[at].kind if at < len(self._tokens) else ""
+
+    def _take(self) -> Token:
+        self._at += 1
+        return self._tokens[self._at - 1]
+
+    def _clauses(self, head: Phrase) -> tuple[Clause, ...]:
+        """Return clauses as long as there are any; "and" and "or" before a relation come back to the first phrase."""
+        out: list[Clause] = []
+        while self._next() and not (self._next() in ("and", "or") and self._next(1) not in ("relation", "not", "")):
+            token = self._take()
+            if token.kind == "not":
+                out += self._negation(head)
+            elif token.kind == "relation":
+                either = self._at > 1 and self._tokens[self._at - 2].kind == "or" and bool(out)
+                out += [replace(c, either=either) for c in self._relation(token, head)]
+                while token.value in _SEVERAL and self._next() == "and" and not self._joins():
+                    self._take()
+                    out += self._relation(token, head)
+            elif token.kind not in ("and", "or"):
+                self._at -= 1
+                more = self._phrase()  # a word that stands after a clause: the lamp on the desk there
+                if self._at < len(self._tokens) and more.generic and more.order is None:
+                    self._at += 1
+        return tuple(out)
+
+    def _joins(self) -> bool:
+        """Whether what follows an "and" stands for itself: it has a relation of its own."""
+        following = (t.kind for t in self._tokens[self._at + 1 :])
+        return next((k == "relation" for k in following if k in ENDS), False)
+
+    def _relation(self, token: Token, head: Phrase, *, negated: bool = False) -> list[Clause]:
+        predicates = tuple(table()["predicates"][token.value])
+        first = self._phrase()
+        other = None
+        if token.value == "between":
+            if self._next() == "and":
+                self._take()
+                other = self._phrase()
+            elif first.generic:
+                return []
+        if first.generic and first.order is None and first.text in (*table()["places"].split(), "anything"):
+            if first.text != "anything":
+                self.places.append(first.text)
+            return []
+        if first.ellipsis:
+            first = replace(first, noun=head.noun, meant=head.meant)
+        if not negated and self._next() == "relation" and not set(first.meant) & _BOUNDS:
+            first = replace(first, where=self._clauses(first))
+        for said, kind, further in (("on", "shelf", "in"), ("in", "container", "on")):
+            if token.value == said and any(is_a(m, kind) for m in first.meant):
+                predicates = (*predicates, further)  # what stands on a board of a shelf is in it
+        return [Clause(token.text, predicates, first, other, negated)]
+
+    def _negation(self, head: Phrase) -> list[Clause]:
+        """Return what must not hold: a relation, or to be what a phrase says, whose noun may be left out."""
+        out: list[Clause] = []
+        if self._next() == "relation":
+            token = self._take()
+            out = self._relation(token, head, negated=True)
+            while self._next() in ("and", "or") and not self._joins():
+                self._take()  # not on the desk or the table
+                out += self._relation(token, head, negated=True)
+            return out
+        while True:
+            phrase = self._phrase()
+            if self._next() == "relation":
+                phrase = replace(phrase, where=tuple(self._relation(self._take(), phrase)))
+            if not phrase.generic or phrase.where or phrase.order:
+                out.append(Clause("not", (), phrase, negated=True))
+            if self._next() not in ("and", "or", "not"):
+                return out
+            self._take()
+
+    def _phrase(self) -> Phrase:
+        """Return what stands up to a clause or a join."""
+        tokens: list[Token] = []
+        while self._next() not in ("", "and", "or", "not", "relation"):
+            token = self._take()
+            if token.value in ("nearest", "farthest"):
+                to = self._measured_from() if token.text.endswith((" to", " from")) else None
+                token = Token("order", token.text, Order(token.value, to=to))
+            elif token.kind == "order":
+                token = Token("order", token.text, Order(token.value))
+            tokens.append(token)
+        return _phrase_of(tokens)
+
+    def _measured_from(self) -> Phrase | None:
+        """Return what "closest to" or "farthest from" is measured from; None where that is not said."""
+        return self._phrase() if self._next() in ("noun", "word", "number", "size", "order", "rank") else None
+
+
+def _alternatives(phrase: Phrase) -> list[Phrase]:
+    """Return a phrase for each of the clauses that "or" joins: "on the desk or on the table"."""
+    groups: list[list[Clause]] = [[]]
+    for clause in phrase.where:
+        groups = [*groups, [*groups[-1][:-1], clause]] if clause.either else [*groups[:-1], [*groups[-1], clause]]
+    return [replace(phrase, where=tuple(g)) for g in groups]
+
+
+def _completed(heads: list[Phrase], *, every: bool) -> list[Phrase]:
+    """Return phrases with the noun that the last has: "blue or red cushions" are two, "a red and white cup" is one."""
+    last = heads[-1]
+    bare = [h for h in heads[:-1] if h.words and not (h.noun or h.use or h.order)]
+    if not bare or len(bare) < len(heads) - 1 or not last.noun:
+        return heads
+    if every:
+        return [replace(last, words=(*(w for h in bare for w in h.words), *last.words))]
+    return [*(replace(last, text=f"{h.text} {' '.join(last.noun)}", words=h.words) for h in bare), last]
+
+
+def _phrase_of(tokens: list[Token]) -> Phrase:
+    """Return the phrase of attributes, nouns of which the last names it, and what else was said of it."""
+    last = {t.kind: t for t in tokens}
+    noun = None if "use" in last else last.get("noun")
+    if noun is not None and "thing" in last and noun.text in adjectives():
+        noun = None  # the orange one
+    words = [
+        w
+        for t in tokens
+        if t is not noun
+        for w in (_name(t) if t.kind == "noun" else [t.value])
+        if t.kind in ("noun", "word")
+    ]
+    order = last["order"].value if "order" in last else None
+    if order is not None and "rank" in last:
+        order = replace(order, rank=last["rank"].value)
+    named = last.get("use", noun)
+    text = " ".join(t.text for t in tokens)
+    places = table()["places"].split()
+    if words and set(words) <= set(places) and {t.kind for t in tokens} == {"word"}:
+        return Phrase(words[0])
+    return Phrase(
+        text or "anything",
+        tuple(w for w in dict.fromkeys(words) if w not in places),
+        () if noun is None else _name(noun),
+        () if named is None else named.value,
+        last["use"].text if "use" in last else None,
+        last["size"].value if "size" in last else None,
+        order,
+        last["number"].value if "number" in last else None,
+        (),
+        last["change"].value if "change" in last else None,
+    )
+
+
+def _name(token: Token) -> tuple[str, ...]:
+    return tuple(split_words(token.text))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,16 +13,30 @@ from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.finding.free_words import WordEncoder
 from list3r.queries.finding.grammar import Clause
-from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of
+from list3r.queries.relations import VERTICAL, Place, noise_of, relations, unit_of, viewer_from
 from list3r.queries.views.camera import camera_of_frame
 from list3r.queries.views.gather import Gathered
 from list3r.queries.views.surfaces import distance_between
-from list3r.queries.views.viewpoint import VIEWPOINT, between
+from list3r.queries.views.viewpoint import VIEWPOINT, Viewpoint, between
 
 _BY_STRUCTURE_M = 0.4
 """Largest distance from a wall at which something is near it, metres: the memory stores `near` for things only."""
 _MOST_OBJECTS = 40
 """Instances that others may be left of, or between: at most this many are considered."""
+_FAR = 1000.0
+"""Metres from which things are seen as on a plan."""
+_ON_PLAN = "far away, as on a plan with x to the right"
+_FADES = 0.1
+"""Per metre: of two things to the left of another the nearer one is meant."""
+_FURTHER = ("near", "in", "on")
+_UNSURE = 0.8
+"""Share of the score of what a word also means: "next to" near, "on the shelf" in it."""
+_COMPARED: dict[str, Callable[[Instance, Instance], bool]] = {
+    "larger": lambda a, b: float(np.max(a.box.size)) > float(np.max(b.box.size)),
+    "smaller": lambda a, b: float(np.max(a.box.size)) < float(np.max(b.box.size)),
+    "higher": lambda a, b: float(a.center[2]) > float(b.center[2]),
+    "lower": lambda a, b: float(a.center[2]) < float(b.center[2]),
+}
 _Pair = tuple[int, str, float, str]
 """Subject, predicate, confidence, and where it is seen from or how far away it is, in words."""
 
@@ -47,6 +61,12 @@ class PhraseSearch:
     """What of a large memory is in `things`; None where it is everything."""
     notes: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    mentioned: dict[int, float] = field(default_factory=dict)
+    """Instances that any part of the question names, with how well."""
+    undecided: bool = False
+    """Whether the memory cannot know a relation that was asked for."""
+    by_look: bool = False
+    """Whether words that nothing bears were compared with how things look."""
 
 
 def related(
@@ -55,17 +75,20 @@ def related(
     clause: Clause,
     ends: tuple[list[PhraseMatch], ...],
     text: str,
+    *,
+    silent: bool = False,
 ) -> list[PhraseMatch]:
     """Return those of `found` that stand in a clause's relation to its ends: the objects and, of `between`, the others.
 
-    `text` is the phrase that `found` match, for notes.
+    `text` is the phrase that `found` match, for notes, of which there are none where `silent`.
     """
     objects, others = (_few(search, end, clause) for end in ends)
-    if clause.other:
+    if clause.predicates == ("between",):
+        others = others if clause.other else objects
         out = _between(search, found, objects, others)
     else:
         out = _standing(search, found, objects, clause.predicates)
-    if not out and objects and (others or not clause.other):
+    if not out and not silent and objects and (others or not clause.other):
         what = clause.object.text + (f" and {clause.other.text}" if clause.other else "")
         search.notes.append(f"{len(found)} instances match {text!r}, but none is known to be {clause.wording} {what!r}")
     return out
@@ -87,14 +110,17 @@ def _standing(
 ) -> list[PhraseMatch]:
     subjects = {c.instance.id: c for c in found}
     best: dict[int, PhraseMatch] = {}
-    if set(predicates) & set(VIEWPOINT):
+    if set(predicates) <= set(_COMPARED):
+        pairs = {o.instance.id: _compared(found, o.instance, predicates) for o in objects}
+    elif set(predicates) & set(VIEWPOINT):
         pairs = {c.instance.id: _seen_pairs(search, subjects, c.instance, predicates) for c in objects}
     else:
         pairs = _stored_pairs(search, subjects, objects, predicates)
     for object in objects:
         for subject, predicate, confidence, via in pairs[object.instance.id]:
             c = subjects[subject]
-            score = c.score * confidence * (0.5 + 0.5 * object.score)
+            further = predicate in _FURTHER and predicate != predicates[0]
+            score = c.score * confidence * (0.5 + 0.5 * object.score) * (_UNSURE if further else 1.0)
             if subject not in best or score > best[subject].score:
                 o = object.instance
                 name = shown_between(o.label or o.description, ";")
@@ -122,29 +148,36 @@ def _stored_pairs(
         held = relations(search.store, None, predicate, objects[0].instance.id)
         if held.state == "unknown":
             search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
+            search.undecided = True
     for c in objects if "near" in predicates else []:
         if c.instance.structure is not None:
             out[c.instance.id] += _near_structure(search, subjects, c.instance)
     return out
 
 
+def _compared(found: list[PhraseMatch], o: Instance, predicates: Sequence[str]) -> list[_Pair]:
+    return [
+        (c.instance.id, f"{p} than", 1.0, "")
+        for c in found
+        for p in predicates
+        if c.instance.id != o.id and _COMPARED[p](c.instance, o)
+    ]
+
+
 def _seen_pairs(
     search: PhraseSearch, subjects: dict[int, PhraseMatch], o: Instance, predicates: Sequence[str]
 ) -> list[_Pair]:
-    """Return which subjects stand so to one object, as seen from the viewpoint."""
+    """Return which subjects stand so to one object, as seen from the viewpoint; what is farther away is less sure."""
     out: list[_Pair] = []
-    place = _viewpoint(search, o)
+    place, unit = viewpoint_of(search, o), unit_of(search.store)
     for predicate in predicates:
-        if place is None:
-            search.notes.append(f"{predicate.replace('_', ' ')} depends on the viewpoint; name one")
-            continue
         held = relations(search.store, None, predicate, o.id, viewpoint=place)
         if held.state == "unknown":
             search.notes.append(f"{predicate.replace('_', ' ')}: unknown, {held.reason}")
-        via = f", {held.reason.split(';')[0]}"
-        out += [
-            (r.subject, r.predicate, r.confidence, via) for r in held if r.subject in subjects and r.subject != o.id
-        ]
+        via = f", {_seen_from(search, held.reason.split(';')[0])}"
+        for r in (r for r in held if r.subject in subjects and r.subject != o.id):
+            away = float(np.linalg.norm(search.things[r.subject].center - o.center)) / unit
+            out.append((r.subject, r.predicate, r.confidence / (1.0 + _FADES * away), via))
     return out
 
 
@@ -161,16 +194,35 @@ def _near_structure(search: PhraseSearch, subjects: dict[int, PhraseMatch], o: I
     return out
 
 
-def _viewpoint(search: PhraseSearch, o: Instance) -> Place | None:
-    """Return the viewpoint of left and right: as asked, else the picture in which the other thing is seen best."""
+def viewpoint_of(search: PhraseSearch, o: Instance) -> Place:
+    """Return the viewpoint of left and right: as asked, else the picture in which a thing is seen best, else as on a
+    plan: far away on the side of small y."""
     if search.viewpoint is not None:
         return search.viewpoint
-    if o.best_view is None:
+    if o.best_view is not None:
+        try:
+            return camera_of_frame(search.store, o.best_view.frame_index, o.best_view.session_id)
+        except OptionError:
+            pass
+    search.notes.append(f"no viewpoint was given: left and right are as seen from {_ON_PLAN}; --from names another")
+    x, y, z = o.center.tolist()
+    return (x, y - _FAR * unit_of(search.store), z)
+
+
+def viewer_of(search: PhraseSearch, o: Instance) -> Viewpoint | None:
+    """Return who looks from the viewpoint; None, with a note, where up is not known."""
+    viewer = viewer_from(search.store, viewpoint_of(search, o))
+    if viewer is None:
+        search.notes.append("gravity is unknown in this memory, so left and right are unknown too")
         return None
-    try:
-        return camera_of_frame(search.store, o.best_view.frame_index, o.best_view.session_id)
-    except OptionError:
-        return None
+    return replace(viewer, name=_seen_from(search, viewer.name))
+
+
+def _seen_from(search: PhraseSearch, reason: str) -> str:
+    """Name the assumed viewpoint by what it is."""
+    if search.viewpoint is not None or "the point" not in reason:
+        return reason
+    return reason[: reason.index("the point")] + _ON_PLAN
 
 
 def _between(

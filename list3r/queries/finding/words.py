@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from list3r.memory.description.words import split_words, vocabulary
+from list3r.memory.description.nouns import nouns_of
+from list3r.memory.description.words import kind_word, split_words, vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 
@@ -23,8 +24,15 @@ def wanted_words(text: str) -> list[str]:
 
 
 def is_named(instance: Instance, text: str) -> bool:
-    """Tell whether label, kind of structure and description together have all the words."""
-    return set(wanted_words(text)) <= words_of(instance)
+    """Tell whether label, kind of structure and description together have all the words, or others for the same."""
+    own = words_of(instance)
+    return all(w in own or same_kind(w) in own for w in wanted_words(text))
+
+
+def same_kind(word: str) -> str:
+    """Return the word under which all that is called so is kept, by whatever name; the word itself where none is."""
+    found = nouns_of(word)
+    return kind_word(found[0]) if found else word
 
 
 def is_colored(instance: Instance, text: str) -> bool:
@@ -35,8 +43,7 @@ def is_colored(instance: Instance, text: str) -> bool:
 def words_of(instance: Instance) -> set[str]:
     """Return all words that may name an instance: of its label, its kind of structure, its description and its
     colour."""
-    texts = (instance.label, instance.structure, instance.description.split(",")[0], instance.color_name)
-    return {word for text in texts for word in split_words(text or "")}
+    return set(vocabulary(instance.label, instance.structure, instance.description, instance.color_name))
 
 
 def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]:

@@ -6,6 +6,7 @@ as asked; only these are loaded. In a memory of up to `EVERYTHING` instances all
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,12 +14,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.description.words import kind_word
+from list3r.memory.errors import UnknownIdError
 from list3r.memory.records import Instance
+from list3r.memory.relations.predicates import PREDICATES
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.words import Bearers
 from list3r.queries.finding.grammar import Clause, Phrase
+from list3r.queries.finding.naming import tiers
 from list3r.queries.match import checked_instance
-from list3r.queries.views.viewpoint import VIEWPOINT
 
 EVERYTHING = 5_000
 """Up to this many instances all are loaded."""
@@ -51,30 +55,52 @@ class Gathered:
 
     def bearing(self, words: tuple[str, ...]) -> list[int]:
         """Return ids that have all of some words, the best first."""
-        ids: list[int] = self._named(words)[0].tolist()
+        ids: list[int] = self.bearers(words)[0].tolist()
         return ids
 
     def named(self, words: tuple[str, ...]) -> Bearers:
         """Return the instances that are looked at of those that have all of some words, the best first."""
-        ids, hundredths = self._named(words)
+        ids, hundredths = self.bearers(words)
         if len(ids) > _MOST:
-            self.notes.append(f"{len(ids)} instances match {' '.join(words)!r}; {_MOST} of them were considered")
+            self.notes.append(f"{len(ids)} instances match {_said(words)!r}; {_MOST} of them were considered")
         return ids[:_MOST], hundredths[:_MOST]
 
-    def _named(self, words: tuple[str, ...]) -> Bearers:
+    def bearers(self, words: tuple[str, ...]) -> Bearers:
+        """Return the instances that have all of some words, the best first."""
         if words not in self._bearing:
             ids, hundredths = self.store.words.bearing(words, _MOST_BEARING + 1)
             if len(ids) > _MOST_BEARING:
-                self.notes.append(f"more than {_MOST_BEARING} instances match {' '.join(words)}; add words")
+                self.notes.append(f"more than {_MOST_BEARING} instances match {_said(words)!r}; add words")
             self._bearing[words] = ids[:_MOST_BEARING], hundredths[:_MOST_BEARING]
         return self._bearing[words]
 
-    def sizes_of(self, words: tuple[str, ...]) -> NDArray[np.float64]:
-        """Return longest edges of some of things that have some words, of any where fewer than four do; ascending."""
-        ids = self._named(words)[0] if words else np.zeros(0, np.int64)
+    def naming(self, phrase: Phrase) -> list[int] | None:
+        """Return ids that the words of a phrase name, the best first; None where it may be anything.
+
+        Of the nouns that it may mean only the first that name anything count, as in `find`.
+        """
+        if phrase.generic:
+            return None
+        if not phrase.meant:
+            return self.bearing(phrase.all_words)
+        for nouns in tiers(phrase):
+            known = self.store.words.known([kind_word(n) for n in nouns])
+            found = dict.fromkeys(n for key in sorted(known) for n in self.bearing((*phrase.words, key)))
+            if found:
+                return list(found)
+        return []
+
+    def sizes_of(self, phrase: Phrase) -> NDArray[np.float64]:
+        """Return longest edges of some of things that a phrase names, of any where fewer than four are; ascending."""
+        ids = np.array(self.naming(phrase) or [], np.int64)
         ids = ids[:: -(-len(ids) // _SAMPLE)] if len(ids) >= 4 else np.array(self.sample)
         ranks = self.store.instances.ranks(ids)
         return np.sort(ranks.longest_edge[~ranks.structure])
+
+
+def _said(words: tuple[str, ...]) -> str:
+    """Return words for a note, kinds of thing too."""
+    return " ".join(w.strip("_").replace("_", " ") for w in words)
 
 
 def is_large(store: Store) -> bool:
@@ -101,14 +127,18 @@ def _candidates(store: Store, phrase: Phrase, out: Gathered) -> list[int] | None
     """Return ids that a phrase may mean, best first; None where it may mean anything. Those of its clauses are kept."""
     found: list[int] | None = None
     if phrase.instance_id is not None:
-        found = [checked_instance(store, phrase.instance_id).id]
-    elif phrase.words:
-        found = out.bearing(phrase.words)
+        with contextlib.suppress(UnknownIdError):
+            found = [checked_instance(store, phrase.instance_id).id]
+    else:
+        found = out.naming(phrase)
+    if phrase.order is not None and phrase.order.to is not None:
+        ends = _candidates(store, phrase.order.to, out)
+        _keep(out, phrase.order.to, out.sample if ends is None else ends)
     for clause in phrase.where:
         objects = _candidates(store, clause.object, out)
         if clause.other is not None:
             _keep(out, clause.other, _candidates(store, clause.other, out) or out.sample)
-        if clause.other is not None or set(clause.predicates) & set(VIEWPOINT):
+        if clause.other is not None or clause.negated or not set(clause.predicates) & set(PREDICATES):
             _keep(out, clause.object, out.sample if objects is None else objects)
             continue
         found = _standing(store, phrase, clause, found, objects, out)

@@ -12,7 +12,7 @@ from list3r.memory.description.words import vocabulary
 from list3r.memory.records import Instance
 from list3r.memory.store.connection import Connection
 
-_WEIGHTS = (100, 90, 80)
+_WEIGHTS = (100, 98, 90, 80)
 """How well a word names an instance, in hundredths, see `memory.description.words`; each is a column."""
 _MOST_WORDS = 6
 """Of a phrase that are told apart by their weights; the others must be there."""
@@ -29,7 +29,7 @@ class Words:
     def put(self, instances: Iterable[Instance]) -> None:
         """Write the words of instances."""
         self._connection.execute_many(
-            "INSERT OR REPLACE INTO words (rowid, w100, w90, w80) VALUES (?, ?, ?, ?)", map(_row, instances)
+            "INSERT OR REPLACE INTO words (rowid, w100, w98, w90, w80) VALUES (?, ?, ?, ?, ?)", map(_row, instances)
         )
 
     def drop(self, instance_id: int) -> None:
@@ -88,7 +88,7 @@ def _quoted(word: str) -> str:
     return '"' + word.replace('"', '""') + '"'
 
 
-def _row(instance: Instance) -> tuple[int, str, str, str]:
+def _row(instance: Instance) -> tuple[int | str, ...]:
     held = vocabulary(instance.label, instance.structure, instance.description, instance.color_name)
     texts = (" ".join(word for word, score in held.items() if round(100 * score) == weight) for weight in _WEIGHTS)
-    return (instance.id, *texts)  # type: ignore[return-value]
+    return (instance.id, *texts)
