@@ -27,7 +27,7 @@ from list3r.memory.relations.structure import StructureSettings
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import GravitySettings, floor_height
+from list3r.memory.world.gravity import GravitySettings, floor_height, sure_of_up
 
 _POSED = 80
 """Posed frames from which it does not matter any more how many there are, see `EvidenceSettings.min_share`."""
@@ -127,6 +127,10 @@ class World:
     """Where the graph's frame lies in the world."""
     edits: int = 0
     """The last edit of an operator that was obeyed."""
+    sure_of_up: float = 1.0
+    """What relations that need up are as sure as at most."""
+    guessed: bool = False
+    """Whether lengths are guessed metres."""
 
     @property
     def stamp(self) -> tuple[int, bytes]:
@@ -178,6 +182,8 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         rules=_rules(store, s),
         T_world_graph=store.facts.S_world_graph,
         edits=last_edit(store),
+        sure_of_up=sure_of_up(store),
+        guessed=store.facts.scale_kind == "guessed",
     )
 
 
@@ -219,7 +225,7 @@ def _by_cameras(store: Store, inside: list[ChunkRow], floor: float | None, unit:
 
 
 def _rules(store: Store, s: ConsolidationSettings) -> int:
-    return zlib.crc32(repr((s, store.facts.scale_kind)).encode())
+    return zlib.crc32(repr((s, store.facts.scale_kind, round(sure_of_up(store), 1))).encode())
 
 
 def _same_frame(a: Sim3, b: Sim3) -> bool:

@@ -236,7 +236,10 @@ class Writer:
         for component in sorted({b.component for b in there}):
             inside = [b for b in there if b.component == component]
             vertical = self._world.upright and component == self._world.first
-            found += relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=measured)
+            sure = self._world.sure_of_up
+            found += relations(
+                inside, gravity_known=vertical, unit=unit, settings=s, measured=measured, sure_of_up=sure
+            )
         kept = [r for r in found if r.subject in subjects or r.object in subjects]
         self._store.relations.replace(sorted(subjects), kept)
 

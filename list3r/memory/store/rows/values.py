@@ -504,7 +504,8 @@ def _is_similarity(value: Any) -> bool:
 
 
 _VALUES: Mapping[str, Callable[[Any], object]] = {
-    "gravity": lambda v: v in ("known", "estimated", "unknown"),
+    "gravity": lambda v: v in ("known", "estimated", "assumed", "unknown"),
+    "gravity_deviation_deg": lambda v: _finite(v) and 0 <= v <= 180,
     "T_world_graph": _is_similarity,
     "gravity_estimate": lambda v: len(v["up"]) == 3 and all(map(_finite, [*v["up"], v["floor_height"] or 0.0])),
     "last_id": lambda v: type(v) is int and 0 <= v < _ID,
