@@ -75,6 +75,10 @@ class GravitySettings:
     """with so many times its votes, and not near as held, surfaces speak against the cameras."""
     shown: float = 0.1
     """Share of the surfaces that must tell each of the two angles of up."""
+    ceiling: float = 3.0
+    """Where so many times more surface faces down than up, and"""
+    ceiling_share: float = 0.03
+    """this share of all does, the camera was held upside down: rooms show more floor and tables than ceiling."""
     held_deviations: float = 3.0
     """Planes of computed depth that are further than this from up as held speak against it."""
 
@@ -166,10 +170,10 @@ def _surfaces(planes: Planes, unit: float, s: GravitySettings) -> tuple[Array, A
 
 
 def _upside_down(faces: Array | NDArray[np.float32], up: Array, s: GravitySettings) -> str | None:
-    """Return a doubt where what is level faces down in the main: rooms show more floor and tables than ceiling."""
+    """Return a doubt where what is level faces down in the main."""
     along, most = faces @ up, np.cos(np.radians(s.level_deg))
     above, below = int((along > most).sum()), int((along < -most).sum())
-    if below > 2 * above and below > s.shown * len(faces):
+    if below > s.ceiling * above and below > s.ceiling_share * len(faces):
         return "most level surfaces face down, as where a camera is held upside down"
     return None
 

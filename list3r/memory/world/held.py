@@ -20,7 +20,7 @@ class HeldSettings:
     """How people hold a camera; the medians of RedKitchen (7-Scenes) are 3 degrees of roll and 26 down."""
 
     level_deg: float = 5.0
-    """Deviation of the roll that the cameras of one side share."""
+    """Deviation of the roll that the cameras of one side share; at least the median roll is."""
     roll_deg: float = 8.0
     """A frame that is rolled by more counts less (Cauchy)."""
     down_deg: float = 15.0
@@ -29,6 +29,12 @@ class HeldSettings:
     """and the deviation of that from recording to recording."""
     most_roll_deg: float = 20.0
     """Median roll beyond which nobody held the camera level."""
+    wide_deg: float = 27.0
+    """Where the x axes are turned by so much (RMS), about 90 degrees in all,"""
+    round: float = 4.0
+    """and go round an axis, this many times wider across it than along,"""
+    askew_deg: float = 15.0
+    """people turn about up: an axis further from it tells that they were rolled alike."""
     turned_deg: float = 15.0
     """A camera that turned by so much (RMS), and about its own x axis alone, was held on its side or only nodded."""
     turned_ratio: float = 0.5
@@ -81,23 +87,26 @@ def up_as_held(S_graph_cam: Sim3, settings: HeldSettings | None = None) -> HeldU
         up = np.linalg.eigh(across / level**2 - np.outer(mean, mean) / pitch**2)[1][:, 0]
         up = up if up @ mean >= 0 else -up
     sides = np.linalg.svd(up[None])[2][1:]
-    known = sides @ across @ sides.T / level**2 + np.eye(2) / pitch**2
+    rolled = float(np.median(np.abs(np.arcsin(np.clip(x @ up, -1, 1)))))
+    known = sides @ across @ sides.T / max(level, rolled) ** 2 + np.eye(2) / pitch**2
     deviation = float(np.degrees(1.0 / np.sqrt(np.linalg.eigvalsh(known)[0])))
-    return HeldUp(up, deviation, _doubt(S_graph_cam, up, own_up, s))
+    return HeldUp(up, deviation, _doubt(S_graph_cam, up, rolled, s))
 
 
-def _doubt(S_graph_cam: Sim3, up: Array, own_up: Array, s: HeldSettings) -> str | None:
-    """Return what speaks against cameras that were held upright."""
-    x = S_graph_cam.rotation[:, :, 0]
-    if float(np.degrees(np.arcsin(np.clip(np.median(np.abs(x @ up)), 0, 1)))) > s.most_roll_deg:
+def _doubt(S_graph_cam: Sim3, up: Array, rolled: float, s: HeldSettings) -> str | None:
+    """Return what speaks against cameras that were held upright; `rolled` is their median roll, radians."""
+    spread, axes = np.linalg.eigh(np.cov(S_graph_cam.rotation[:, :, 0].T, bias=True))
+    askew = abs(axes[:, 0] @ up) < np.cos(np.radians(s.askew_deg)) and spread[1] > s.round * spread[0]
+    askew = askew and spread.sum() > np.sin(np.radians(s.wide_deg)) ** 2
+    if rolled > np.radians(s.most_roll_deg) or askew:
         return "the camera was not held level"
-    turned, nodded = _spread(x), _spread(own_up)
+    turned, nodded = (_spread(S_graph_cam.rotation[:, :, k]) for k in (0, 1))
     if nodded > np.sin(np.radians(s.turned_deg)) and turned < s.turned_ratio * nodded:
         return "the camera turned about its own x axis alone, as one does that is held on its side"
     moved = S_graph_cam.translation - S_graph_cam.translation.mean(axis=0)
-    along = float(np.sqrt(((moved @ up) ** 2).mean()))
-    beside = np.linalg.svd(up[None])[2][1:]
-    if along > s.risen * float(np.linalg.norm(moved @ beside.T, axis=1).max(initial=0.0)) / np.sqrt(3.0) > 0.0:
+    beside = moved - np.outer(moved @ up, up)
+    along, aside = (float(np.sqrt((m**2).sum() / len(m))) for m in (moved - beside, beside))
+    if along > s.risen * aside > 0.0:
         return "the camera moved up and down and not to the sides, as one does that is held on its side"
     return None
 
