@@ -35,6 +35,7 @@ from list3r.pipeline.filming import film_advice
 from list3r.pipeline.finishing import guess_anew
 from list3r.pipeline.placing import place_chunks
 from list3r.pipeline.settings import BuildSettings
+from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.walk import look_poses
 from tests.conftest import box_points, chunk_result, local_instance, small_picture
 from tests.test_relations import kitchen
@@ -181,7 +182,22 @@ def test_up_as_it_was_asked_for(tmp_path: Path, up: str, status: str, z: Array |
             assert lean(store.chunks.all()[0].S_world_chunk.rotation @ Z, z) < 1.0
 
 
-def test_a_direction_is_read_and_nonsense_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_build_takes_a_direction_of_the_first_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    walk = write_walk(tmp_path / "walk", WalkSettings(frames=24, size=(128, 96)))
+    memory = tmp_path / "a.l3r"
+    build = ["build", str(walk), "-m", str(memory), "--workers", "0", "--poses", "estimate", "--json"]
+    assert run([*build, "--up", "sideways"]) == 2 and "--up sideways" in capsys.readouterr().err
+    assert not memory.exists()
+    assert run([*build, "--up", "0,-1,0"]) == 0
+    assert json.loads(capsys.readouterr().out)["matches"][0]["film"]  # 24 frames are few
+    with open_scene(memory) as scene:
+        assert scene.gravity == "known"
+        np.testing.assert_allclose(-scene.store.trajectory.poses()[0][1].rotation[:, 1], Z, atol=1e-6)
+    assert run(["update", str(memory), str(walk), "--up", "camera"]) == 2
+    assert "--up camera is for build" in capsys.readouterr().err
+
+
+def test_a_direction_is_read_and_nonsense_is_refused() -> None:
     np.testing.assert_allclose(parse_up("0,-2,0"), [0, -1, 0])
     assert parse_up("camera") is None
     for text in ("sideways", "0,0,0", "1,2", "nan,0,1"):

@@ -60,9 +60,8 @@ def scene_dict(store: Store) -> dict[str, Any]:
             "units": units(store),
             "metric": (store.facts.scale_kind or "relative"),
             "metric_source": store.facts.scale_source,
-            "metric_deviation": lengths_of(store).deviation,
             "gravity": gravity,
-            "gravity_deviation_deg": store.facts.gravity_deviation_deg,
+            **_deviations(store),
         },
         "sessions": _sessions(store),
         "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
@@ -76,6 +75,13 @@ def scene_dict(store: Store) -> dict[str, Any]:
         "relations": [_relation(r, decimals) for r in relations],
         "aliases": [{"id": k, "instance": v} for k, v in store.ids.aliases().items()],
     }
+
+
+def _deviations(store: Store) -> dict[str, float]:
+    """Return how surely a guessed metre and up are known, where that is known."""
+    deviations = {"metric_deviation": lengths_of(store).deviation}
+    deviations["gravity_deviation_deg"] = store.facts.gravity_deviation_deg
+    return {name: value for name, value in deviations.items() if value is not None}
 
 
 def _length_decimals(store: Store, components: list[Component]) -> int:
