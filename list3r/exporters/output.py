@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from list3r.memory.errors import ExportError
-from list3r.memory.world.scale import lengths_of
 
 if TYPE_CHECKING:
     from list3r.memory.store.store import Store
@@ -151,4 +150,4 @@ def part_path(path: Path, name: str) -> Path:
 def units(store: Store) -> str:
     """Return the unit of length: "m" for a metric or anchored memory, "unit" for a relative one (arbitrary scale) and a
     guessed one (about a metre)."""
-    return lengths_of(store).units
+    return "m" if store.facts.scale_kind in ("metric", "anchored") else "unit"
