@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +36,7 @@ from list3r.pipeline.filming import film_advice
 from list3r.pipeline.finishing import guess_anew
 from list3r.pipeline.placing import place_chunks
 from list3r.pipeline.settings import BuildSettings
+from list3r.queries.relations import relations as find_relations
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.walk import look_poses
 from tests.conftest import box_points, chunk_result, local_instance, small_picture
@@ -141,10 +143,23 @@ def test_evidence_that_contradicts_itself_leaves_up_unknown(cameras: Sim3, plane
 @pytest.mark.parametrize("width", [45.0, 120.0, 300.0])
 def test_up_is_never_wrong_by_twenty_degrees_unsaid(roll: float, width: float) -> None:
     for pitch in (-60.0, -30.0, 0.0):
-        for planes in (faces(), faces(level=60), *([NOTHING] if roll != 180.0 else [])):  # alike without surfaces
+        flat = replace(
+            faces(),
+            normal=np.array([Z, *np.eye(3)[[0, 1]]]),
+            center=np.array([[0.0, 0, 0], [2, 0, 1], [0, 2, 1]]),
+            area=np.array([2.0, 4.0, 4.0]),
+        )
+        for planes in (faces(), faces(level=60), flat, *([NOTHING] if roll != 180.0 else [])):  # alike without surfaces
             found = gravity_from_planes(planes, held((10.0, 10.0 + width), pitch, roll, noise_deg=4.0))
             error = lean(found.up)
             assert found.status == "unknown" or error < max(15.0, 2.0 * (found.deviation_deg or 0.0)), (pitch, error)
+
+
+def test_planes_tell_up_where_all_cameras_were_rolled_alike() -> None:
+    none = np.zeros((0, 3))
+    floor = Planes(Z[None], np.zeros((1, 3)), np.array([2.0]), none, np.zeros(0, int), faces().faces)
+    found = gravity_from_planes(floor, held((0.0, 150.0), roll_deg=17.0, noise_deg=1.0))
+    assert found.status == "estimated" and lean(found.up) < 2.0
 
 
 def test_faces_look_at_the_cameras() -> None:
@@ -259,6 +274,8 @@ def test_a_metre_is_guessed_and_says_so(memory: Path, tmp_path: Path, capsys: py
     assert run(["query", "within", str(memory), "--point", "1,1,1", "--radius", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["units"], answer["metric"], answer["metre_deviation"]) == ("unit", "guessed", lengths.deviation)
+    assert run(["query", "within", str(memory), "--point", "2,2,1", "--radius", "2"]) == 0
+    assert "lengths are about metres" in capsys.readouterr().err
     assert run(["scale", str(memory)]) == 0 and "about metres" in capsys.readouterr().out
 
 
@@ -324,6 +341,16 @@ def test_up_of_another_part_is_unknown(memory: Path) -> None:
         assert gravity_of(store, rows[1].chunk_id) == "unknown"
         part = next(c for c in read_components(store) if c.id == rows[1].chunk_id)
         assert "gravity unknown" in choose_rotation(part, gravity_of(store, part.id))[1]
+
+
+def test_an_answer_says_that_up_is_assumed(make_memory: Callable[..., Path]) -> None:
+    with Store.open(make_memory(), writable=True) as store:
+        assert "assumed" not in find_relations(store, predicate="on").reason
+        with store.transaction():
+            store.facts.gravity, store.facts.gravity_deviation_deg = "assumed", 7.2
+        found = find_relations(store, predicate="on")
+        assert found and "up is assumed" in found.reason and "7 degrees" in found.reason
+        assert "assumed" not in find_relations(store, predicate="near").reason
 
 
 # ---------------------------------------------------------------------------------------------- how to film

@@ -196,6 +196,8 @@ def _build_notes(store: Store, session: int, lost: int, bad: int, components: in
     notes += lost_reasons(store, session)
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
+        if store.facts.gravity != "unknown":
+            notes.append("which way is up is known in the first part alone")
     if store.facts.gravity == "unknown":
         notes.append("which way is up is unknown; vertical relations (on, above, below) are left out")
     return tuple(notes)

@@ -81,6 +81,9 @@ def relations(
         (r for r in found if r.confidence >= min_confidence),
         key=lambda r: (-r.confidence, r.subject, r.predicate, r.object),
     )
+    if store.facts.gravity == "assumed" and any(r.predicate in VERTICAL for r in kept):
+        deviation = store.facts.gravity_deviation_deg or 0.0
+        notes.append(f"up is assumed by how the camera was held, give or take {deviation:.0f} degrees")
     return Relations(kept, found.state, "; ".join([*([found.reason] if found.reason else []), *notes]))
 
 

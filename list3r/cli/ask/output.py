@@ -114,6 +114,8 @@ def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **
     if total is not None and total > len(matches):
         note(f"note: the best {len(matches)} of {total}; -k {total} shows all")
     placed = any(m.distance_m is not None or m.center_distance_m is not None for m in matches)
+    if placed and not isinstance(units, str) and units.deviation is not None:
+        note(f"note: lengths are about metres, a guess, give or take {units.deviation:.0%}")
     rows = [
         [
             m.instance.id,

@@ -150,7 +150,8 @@ class _SceneWriter:
         scale = "Lengths: cm." if units == "m" else "Lengths: arbitrary units, the scale is unknown."
         if guess is not None:
             scale = f"Lengths: about cm, the metre is a guess, give or take {guess:.0%}."
-        up = "z is up." if gravity != "unknown" else "Which way is up is unknown, so on and above are left out."
+        held = ", assumed by how the camera was held" if gravity == "assumed" else ""
+        up = f"z is up{held}." if gravity != "unknown" else "Which way is up is unknown, so on and above are left out."
         parts = f" {self.parts} parts that are not placed against each other." if self.parts > 1 else ""
         lines = [
             f"# {self.memory.path.name}: {solid} things, {len(self.things) - solid} of structure",

@@ -124,11 +124,14 @@ def gravity_from_planes(
     found = _by_planes(planes, S_graph_cam, unit, s) if by_planes else None
     doubt = held.doubt or _upside_down(planes.faces, held.up, s)
     if found is None and doubt is None:
-        found = _as_held(held, planes, S_graph_cam, unit, s)
+        level = "the camera was not held level and no level surface tells more"
+        found = (
+            Gravity("unknown", held.up, None, level) if held.rolled else _as_held(held, planes, S_graph_cam, unit, s)
+        )
     if found is None or not len(planes.faces) or found.status == "unknown":
         return found or Gravity("unknown", held.up, None, doubt or "no level surface agrees with the cameras")
     apart = float(np.degrees(np.arccos(np.clip(found.up @ held.up, -1, 1))))
-    if doubt is None and apart > max(s.held_deviations * held.deviation_deg, s.near_deg):
+    if doubt is None and not held.rolled and apart > max(s.held_deviations * held.deviation_deg, s.near_deg):
         doubt = f"level surfaces lie {apart:.0f} degrees from how the camera was held"
     return found if doubt is None else Gravity("unknown", held.up, None, doubt)
 
@@ -180,6 +183,8 @@ def _upside_down(faces: Array | NDArray[np.float32], up: Array, s: GravitySettin
 
 def _as_held(held: HeldUp, planes: Planes, S_graph_cam: Sim3, unit: float, s: GravitySettings) -> Gravity:
     """Return up as the camera was held, corrected by the surfaces that agree with it."""
+    if held.rolled:
+        return Gravity("unknown", held.up, None, "the camera was not held level and no level surface tells more")
     normals, weights = _surfaces(planes, unit, s)
     up, deviation, how = held.up, held.deviation_deg, "the camera was held upright"
     if len(normals):
@@ -282,19 +287,6 @@ def floor_height(
     if below > s.floor_below or camera < s.floor_camera_height_m * unit:
         return None
     return height
-
-
-def level_below(up: Array, planes: Planes, eyes: float, settings: GravitySettings | None = None) -> float | None:
-    """Return the height along `up` of the level surface under the cameras with the most area; None where there is none.
-
-    `eyes` is the height of the lowest cameras. What is a tenth as broad as the broadest surface seen is not asked.
-    """
-    s = settings or GravitySettings()
-    heights = planes.center @ up
-    found = (planes.normal @ up > np.cos(np.radians(s.level_deg))) & (heights < eyes)
-    if not found.any() or planes.area[found].max() < 0.1 * planes.area.max():
-        return None
-    return float(heights[found][int(np.argmax(planes.area[found]))])
 
 
 def estimate_gravity(

@@ -13,13 +13,15 @@ import numpy as np
 
 from list3r.memory.geometry import Sim3
 from list3r.memory.overlap.metre import CAMERA_M, CAMERA_SPREAD, DEPTH_SPREAD
-from list3r.memory.overlap.planes import place_planes
 from list3r.memory.overlap.summaries import cameras_of, chunk_summaries, sample_of
 from list3r.memory.records import ChunkRow, Instance
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import Gravity, level_below
+from list3r.memory.world.gravity import Gravity
 
+_TABLES = ("table", "dining table", "desk")
+_SEEN = 0.35
+"""Deviation of the logarithm of what was seen of a thing that was named."""
 USUAL_M: Mapping[str, tuple[float, float]] = {
     "bed": (2.0, 0.15),
     "bottle": (0.25, 0.3),
@@ -44,10 +46,10 @@ class GuessSettings:
 
     most_deviation: float = 0.3
     """As a share of a metre, beyond which nothing is guessed."""
-    table_m: float = 0.74
-    """Height of tables over the floor; where no floor is seen the lowest broad level surface is one, about."""
+    over_table_m: float = 0.66
+    """Height of the cameras over a table, where no floor is seen, and"""
     over_table_spread: float = 0.33
-    """Deviation of the logarithm of the cameras' height over it: it may be a bed, or a counter."""
+    """the deviation of its logarithm."""
     apart: float = 2.0
     """Deviations between two sources from which the less exact one is left out."""
     steady: float = 0.04
@@ -115,7 +117,7 @@ def guess_metre(
     `S_graph_chunk` and `gravity` are of the frame of the pose graph. Names are those that instances have now.
     """
     s, said = settings or GuessSettings(), _Sources()
-    summaries = chunk_summaries(store)
+    summaries, scale = chunk_summaries(store), float(store.facts.S_world_graph.scale)
     some = [_placed(c, S_graph_chunk) for c in sample_of(chunks)]
     depths = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in some]
     if not depths:
@@ -126,18 +128,15 @@ def guess_metre(
         middle = float(np.median(heights))
         if gravity.floor_height is not None:
             said.add((middle - gravity.floor_height) / CAMERA_M, CAMERA_SPREAD, "the camera's height over the floor")
-        else:
-            planes = place_planes([(summaries.planes(c.chunk_id), c.S_world_chunk) for c in some])
-            table = level_below(gravity.up, planes, float(np.quantile(heights, 0.05)))
-            over = None if table is None else (middle - table) / (CAMERA_M - s.table_m)
-            said.add(over or 0.0, s.over_table_spread, "the camera's height over a table")
-    scale = float(store.facts.S_world_graph.scale)
-    for unit, deviation, name in _by_names(store.instances.all(structure=False), chunks[0].component):
-        said.add(unit / scale, deviation, name)
-    found = said.together(s.apart)
-    before = store.facts[GUESS]
+        elif store.facts.gravity != "unknown":
+            over = _over_table(store, chunks) / scale
+            said.add(over / s.over_table_m, s.over_table_spread, "the camera's height over a table")
+    found, before = said.together(s.apart), store.facts[GUESS]
     if found is None or found.deviation > s.most_deviation:
         return None
+    for unit, deviation, name in _by_names(store.instances.all(structure=False), chunks[0].component):
+        said.add(unit / scale, deviation, name)
+    found = said.together(s.apart) or found
     if before is not None and abs(before.metres / found.metres - 1.0) < s.steady:
         return MetreGuess(before.metres, found.deviation, found.source)
     return found
@@ -147,10 +146,24 @@ def _placed(chunk: ChunkRow, S_graph_chunk: Mapping[int, Sim3]) -> ChunkRow:
     return replace(chunk, S_world_chunk=S_graph_chunk[chunk.chunk_id])
 
 
+def _over_table(store: Store, chunks: Sequence[ChunkRow]) -> float:
+    """Return the cameras' median height over the largest thing that is named a table, world units; 0 for none."""
+    things = store.instances.all(structure=False)
+    tables = [i for i in things if i.label in _TABLES and i.component == chunks[0].component and not i.dynamic]
+    if not tables:
+        return 0.0
+    largest = max(tables, key=lambda i: float(i.box.size.max()))
+    placed = {c.chunk_id for c in chunks}
+    rows = sample_of([c for c in store.chunks.all() if c.chunk_id in placed])
+    eyes = float(np.median(cameras_of(store, rows).translation[:, 2]))
+    return eyes - float(largest.aabb[1, 2])
+
+
 def _by_names(instances: Sequence[Instance], component: int) -> list[tuple[float, float, str]]:
     """Return what a metre is in world units by each class that has a usual size, from the median of its things.
 
-    More things of a class share what is usual about it, so they are only surer of what was seen.
+    More things of a class share what is usual about it, so they are only surer of what was seen. They make a guess
+    better and none alone: what is named is often a part of a thing, or another one.
     """
     sizes: dict[str, list[float]] = {}
     for i in instances:
@@ -160,6 +173,6 @@ def _by_names(instances: Sequence[Instance], component: int) -> list[tuple[float
     out = []
     for name, lengths in sorted(sizes.items()):
         usual, deviation = USUAL_M[name]
-        seen = 0.25 / math.sqrt(len(lengths))
+        seen = _SEEN / math.sqrt(len(lengths))
         out.append((float(np.median(lengths)) / usual, math.hypot(deviation, seen), f"the size of a {name}"))
     return out

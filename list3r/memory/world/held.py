@@ -51,8 +51,10 @@ class HeldUp:
     """Unit vector. Shape (3,)."""
     deviation_deg: float
     """Of that direction, along the worst axis."""
+    rolled: bool = False
+    """Whether the cameras were not held level: they do not tell up, and surfaces may."""
     doubt: str | None = None
-    """Why the cameras were not held upright; None where nothing speaks against it."""
+    """Why the pictures lie on their side, whatever surfaces seem to say; None where nothing speaks for that."""
 
 
 def parse_up(text: str) -> Array | None:
@@ -90,16 +92,19 @@ def up_as_held(S_graph_cam: Sim3, settings: HeldSettings | None = None) -> HeldU
     rolled = float(np.median(np.abs(np.arcsin(np.clip(x @ up, -1, 1)))))
     known = sides @ across @ sides.T / max(level, rolled) ** 2 + np.eye(2) / pitch**2
     deviation = float(np.degrees(1.0 / np.sqrt(np.linalg.eigvalsh(known)[0])))
-    return HeldUp(up, deviation, _doubt(S_graph_cam, up, rolled, s))
+    askew = rolled > np.radians(s.most_roll_deg) or _rolled_alike(x, up, s)
+    return HeldUp(up, deviation, askew, _on_side(S_graph_cam, up, s))
 
 
-def _doubt(S_graph_cam: Sim3, up: Array, rolled: float, s: HeldSettings) -> str | None:
-    """Return what speaks against cameras that were held upright; `rolled` is their median roll, radians."""
-    spread, axes = np.linalg.eigh(np.cov(S_graph_cam.rotation[:, :, 0].T, bias=True))
-    askew = abs(axes[:, 0] @ up) < np.cos(np.radians(s.askew_deg)) and spread[1] > s.round * spread[0]
-    askew = askew and spread.sum() > np.sin(np.radians(s.wide_deg)) ** 2
-    if rolled > np.radians(s.most_roll_deg) or askew:
-        return "the camera was not held level"
+def _rolled_alike(x: Array, up: Array, s: HeldSettings) -> bool:
+    """Return whether x axes (F, 3) that go round an axis tell that it is another one than up."""
+    spread, axes = np.linalg.eigh(np.cov(x.T, bias=True))
+    wide = spread.sum() > np.sin(np.radians(s.wide_deg)) ** 2 and spread[1] > s.round * spread[0]
+    return bool(wide and abs(axes[:, 0] @ up) < np.cos(np.radians(s.askew_deg)))
+
+
+def _on_side(S_graph_cam: Sim3, up: Array, s: HeldSettings) -> str | None:
+    """Return what tells that the pictures lie on their side."""
     turned, nodded = (_spread(S_graph_cam.rotation[:, :, k]) for k in (0, 1))
     if nodded > np.sin(np.radians(s.turned_deg)) and turned < s.turned_ratio * nodded:
         return "the camera turned about its own x axis alone, as one does that is held on its side"
