@@ -331,6 +331,21 @@ def test_names_make_a_guess_better(memory: Path) -> None:
         assert not store.verify()
 
 
+def test_without_a_floor_a_table_tells_a_metre_and_other_names_none(memory: Path) -> None:
+    with Store.open(memory, writable=True) as store, store.transaction():
+        chunks, S_graph_world = store.chunks.all(), store.facts.S_world_graph.inverse()
+        graph = {c.chunk_id: S_graph_world @ c.S_world_chunk for c in chunks}
+        estimate = store.facts.gravity_estimate
+        assert estimate is not None
+        no_floor, store.facts[GUESS] = Gravity("estimated", estimate.up, None, ""), None
+        things = [i for i in store.instances.all(structure=False) if abs(i.aabb[1, 2] - 0.75) < 0.3]
+        store.instances.set_labels({i.id: "chair" for i in things})
+        assert guess_metre(store, chunks, graph, no_floor) is None
+        store.instances.set_labels({things[0].id: "table"})
+        found = guess_metre(store, chunks, graph, no_floor)
+        assert found is not None and "over a table" in found.source and 0.14 < found.deviation < 0.3
+
+
 def test_up_of_another_part_is_unknown(memory: Path) -> None:
     with Store.open(memory, writable=True) as store:
         rows = store.chunks.all()
