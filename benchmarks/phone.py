@@ -7,7 +7,7 @@ given by its poses; up in them is the normal of the table and the floor in its d
 frames: `portrait` (240x320 px) through two rooms, `tilted` (320x240) with the camera rolled by 20 degrees, `pan`
 (240x320) a turn on the spot by 200 degrees. Of the bedroom (frames of SAM 2) there is no truth: what is found is
 listed. With `--detector FILE` things get names. `find "cup on table"` is asked. Reconstructions in `--keep` are used
-again.
+again, and of memories the chunks with what was named: how they lie, up, the metre and the library are derived anew.
 
 `up_error_deg` is the angle of the memory's z to up where the memory says that z is up, by the cameras' orientations;
 `metre_error` is by how much a metre of the memory is too long, by the cameras' places.
@@ -35,6 +35,10 @@ from numpy.typing import NDArray
 from list3r.api import open as open_memory
 from list3r.memory.geometry import umeyama
 from list3r.memory.store.store import Store
+from list3r.memory.world.guess import GUESS
+from list3r.pipeline.filming import film_advice
+from list3r.pipeline.finishing import guess_anew
+from list3r.pipeline.mapping import finish_session
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import sense
@@ -185,29 +189,36 @@ def up_of_depth(kitchen: Path) -> Array:
 def measured(clip: Clip, root: Path, detector: str | None) -> dict[str, Any]:
     """What a build makes of a clip, against the truth."""
     memory = root / f"{clip.video.stem}.l3r"
-    named = () if detector is None else ("--detector", detector)
-    command = ["build", str(clip.video), "-m", str(memory), "--force", "--workers", "0", "--json", *named]
-    answer = built(command, root / clip.video.stem)
-    if "error" in answer:
-        print(clip.name, answer["error"])
-        return {"clip": clip.name, "error": answer["error"]["message"]}
-    (report,) = answer["matches"]
+    if memory.exists():
+        derive_anew(memory)
+    else:
+        named = () if detector is None else ("--detector", detector)
+        answer = built(["build", str(clip.video), "-m", str(memory), "--json", *named], root / clip.video.stem)
+        if "error" in answer:
+            print(clip.name, answer["error"])
+            return {"clip": clip.name, "error": answer["error"]["message"]}
     with open_memory(memory) as scene:
         facts, found = scene.info(), scene.find(QUESTION)
+        told = ("frames", "posed", "components", "instances", "gravity", "gravity_deviation_deg", "scale")
         row = {
             "clip": clip.name,
-            "frames": report["frames"],
-            "posed": report["posed"],
-            "parts": report["components"],
-            **{k: facts[k] for k in ("gravity", "gravity_deviation_deg", "scale", "metre_deviation")},
-            "instances": report["instances"],
+            **{k: facts[k] for k in (*told, "metre_deviation", "scale_source")},
             "found": [f"#{m.instance.id} {m.instance.label or m.instance.description}: {m.reason}" for m in found],
             "unknown_words": list(found.unknown_words),
-            "film": report["film"],
+            "film": film_advice(scene.store, 1),
             **errors(scene.store, clip),
         }
     print(row)
     return row
+
+
+def derive_anew(memory: Path) -> None:
+    """Place the chunks of a memory that is there, and derive its library, up and metre from them, without a guess."""
+    with Store.open(memory, writable=True) as store:
+        with store.transaction():
+            store.facts[GUESS] = None
+        finish_session(store, 1)
+    guess_anew(memory)
 
 
 def built(command: list[str], kept: Path) -> dict[str, Any]:
