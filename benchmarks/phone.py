@@ -216,7 +216,7 @@ def derive_anew(memory: Path) -> None:
     """Place the chunks of a memory that is there, and derive its library, up and metre from them, without a guess."""
     with Store.open(memory, writable=True) as store:
         with store.transaction():
-            store.facts[GUESS] = None
+            store.facts[GUESS] = store.facts.metres_per_graph_unit = None
         finish_session(store, 1)
     guess_anew(memory)
 
