@@ -124,10 +124,7 @@ def gravity_from_planes(
     found = _by_planes(planes, S_graph_cam, unit, s) if by_planes else None
     doubt = held.doubt or _upside_down(planes.faces, held.up, s)
     if found is None and doubt is None:
-        level = "the camera was not held level and no level surface tells more"
-        found = (
-            Gravity("unknown", held.up, None, level) if held.rolled else _as_held(held, planes, S_graph_cam, unit, s)
-        )
+        found = _as_held(held, planes, S_graph_cam, unit, s)
     if found is None or not len(planes.faces) or found.status == "unknown":
         return found or Gravity("unknown", held.up, None, doubt or "no level surface agrees with the cameras")
     apart = float(np.degrees(np.arccos(np.clip(found.up @ held.up, -1, 1))))
