@@ -44,12 +44,14 @@ USUAL_M: Mapping[str, tuple[float, float]] = {
 class GuessSettings:
     """When a guess is good enough, and what people film."""
 
-    most_deviation: float = 0.3
+    most_deviation: float = 0.2
     """As a share of a metre, beyond which nothing is guessed."""
     over_table_m: float = 0.66
     """Height of the cameras over a table, where no floor is seen, and"""
     over_table_spread: float = 0.33
     """the deviation of its logarithm."""
+    least_names: int = 2
+    """Classes of usual size that must be named beside the table, for what was named may be the floor or a bed."""
     apart: float = 2.0
     """Deviations between two sources from which the less exact one is left out."""
     steady: float = 0.04
@@ -120,23 +122,24 @@ def guess_metre(
     summaries, scale = chunk_summaries(store), float(store.facts.S_world_graph.scale)
     some = [_placed(c, S_graph_chunk) for c in sample_of(chunks)]
     depths = [float(c.S_world_chunk.scale) * summaries[c.chunk_id].unit for c in some]
-    if not depths:
+    centers = cameras_of(store, some).translation
+    if not depths or not len(centers) or gravity.status == "unknown":
         return None
     said.add(float(np.median(depths)), DEPTH_SPREAD, "how far things are")
-    if gravity.status != "unknown":
-        heights = cameras_of(store, some).translation @ gravity.up
-        middle = float(np.median(heights))
-        if gravity.floor_height is not None:
-            said.add((middle - gravity.floor_height) / CAMERA_M, CAMERA_SPREAD, "the camera's height over the floor")
-        elif store.facts.gravity != "unknown":
-            over = _over_table(store, chunks) / scale
-            said.add(over / s.over_table_m, s.over_table_spread, "the camera's height over a table")
+    names = _by_names(store.instances.all(structure=False), chunks[0].component)
+    if gravity.floor_height is not None:
+        height = float(np.median(centers @ gravity.up)) - gravity.floor_height
+        said.add(height / CAMERA_M, CAMERA_SPREAD, "the camera's height over the floor")
+    elif store.facts.gravity != "unknown" and len(names) >= s.least_names:
+        over = _over_table(store, chunks) / scale
+        said.add(over / s.over_table_m, s.over_table_spread, "the camera's height over a table")
+    if len(said.said) < 2:
+        return None
+    for unit, deviation, name in names:
+        said.add(unit / scale, deviation, name)
     found, before = said.together(s.apart), store.facts[GUESS]
     if found is None or found.deviation > s.most_deviation:
         return None
-    for unit, deviation, name in _by_names(store.instances.all(structure=False), chunks[0].component):
-        said.add(unit / scale, deviation, name)
-    found = said.together(s.apart) or found
     if before is not None and abs(before.metres / found.metres - 1.0) < s.steady:
         return MetreGuess(before.metres, found.deviation, found.source)
     return found
@@ -162,8 +165,8 @@ def _over_table(store: Store, chunks: Sequence[ChunkRow]) -> float:
 def _by_names(instances: Sequence[Instance], component: int) -> list[tuple[float, float, str]]:
     """Return what a metre is in world units by each class that has a usual size, from the median of its things.
 
-    More things of a class share what is usual about it, so they are only surer of what was seen. They make a guess
-    better and none alone: what is named is often a part of a thing, or another one.
+    More things of a class share what is usual about it, so they are only surer of what was seen. They tell nothing
+    where the cameras' height does not: what is named is often a part of a thing, or another one.
     """
     sizes: dict[str, list[float]] = {}
     for i in instances:
