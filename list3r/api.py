@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.errors import List3rError, OptionError, check_share, naming_extras
 from list3r.memory.maintenance.editing import MemoryEdits
 from list3r.memory.store.store import Store
+from list3r.memory.world.scale import Lengths, lengths_of
 
 if TYPE_CHECKING:
     import networkx
@@ -198,13 +199,18 @@ class SceneMemory(MemoryEdits):
 
     @property
     def units(self) -> str:
-        """`m` when lengths are metres, `unit` when the memory has no known scale."""
+        """`m` when lengths are metres, `unit` when nobody knows; one is about a metre where `lengths` says guessed."""
+        return self.lengths.units
+
+    @property
+    def lengths(self) -> Lengths:
+        """The unit of lengths, who knows it, and how surely."""
         with self._lock:
-            return "unit" if self.store.facts.scale_kind == "relative" else "m"
+            return lengths_of(self.store)
 
     @property
     def gravity(self) -> str:
-        """known, estimated (z is up in both) or unknown."""
+        """known, estimated by surfaces, assumed by how the camera was held (z is up in all three), or unknown."""
         with self._lock:
             return self.store.facts.gravity
 

@@ -45,7 +45,7 @@ class MemoryEntry:
     @property
     def units(self) -> str:
         """`m` when lengths are metres, `unit` when the memory has no known scale."""
-        return "unit" if self.scale_kind == "relative" else "m"
+        return "m" if self.scale_kind in ("metric", "anchored") else "unit"
 
 
 @dataclass(frozen=True)

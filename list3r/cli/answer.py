@@ -5,20 +5,29 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from list3r.cli.terminal import write
+
+if TYPE_CHECKING:
+    from list3r.memory.world.scale import Lengths
 
 SCHEMA = "list3r/answer/1"
 """Name and version of the envelope; the number goes up when a reader of the old one would misread the new one."""
 
 
-def print_answer(matches: Iterable[object], units: str | None = None, notes: Iterable[str] = (), **facts: Any) -> None:
+def print_answer(
+    matches: Iterable[object], units: Lengths | str | None = None, notes: Iterable[str] = (), **facts: Any
+) -> None:
     """Print an answer as JSON on standard output; NaN becomes null.
 
     `matches` are the entries that were asked for, one for a report. `units` is the unit of lengths, None where there
-    are none. `notes` are sentences for people. `facts` are said of the answer as a whole, such as `total`.
+    are none; of a memory also who knows it. `notes` are sentences for people. `facts` are said of the answer as a
+    whole, such as `total`.
     """
+    if units is not None and not isinstance(units, str):
+        facts = {"metric": units.metric, "metre_deviation": units.deviation, **facts}
+        units = units.units
     answer = {"schema": SCHEMA, "units": units, "matches": list(matches), "notes": list(notes), **facts}
     write(json.dumps(_plain(answer), indent=2, allow_nan=False) + "\n")
 

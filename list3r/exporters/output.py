@@ -148,5 +148,6 @@ def part_path(path: Path, name: str) -> Path:
 
 
 def units(store: Store) -> str:
-    """Return the unit of length: "m" for a metric or anchored memory, "unit" for a relative one (arbitrary scale)."""
+    """Return the unit of length: "m" for a metric or anchored memory, "unit" for a relative one (arbitrary scale) and a
+    guessed one (about a metre)."""
     return "m" if store.facts.scale_kind in ("metric", "anchored") else "unit"

@@ -16,6 +16,7 @@ from list3r.memory.geometry import quat_wxyz_from_rotation
 from list3r.memory.library.labels import label_source
 from list3r.memory.records import Instance, Relation
 from list3r.memory.store.store import Store
+from list3r.memory.world.scale import lengths_of
 
 FORMAT = "list3r-scene-graph"
 VERSION = 1
@@ -40,9 +41,9 @@ def write_scene_json(store: Store, path: str | Path) -> tuple[Path, ...]:
 def scene_dict(store: Store) -> dict[str, Any]:
     """Return the scene graph of a memory as plain JSON values, without NaN.
 
-    `frame.up` is [0, 0, 1] where gravity is known or estimated and null where it is unknown; `frame.units` is "m" for
-    a metric or anchored memory and "unit" for a relative one; geometry that an instance lacks is null. Coordinates of
-    instances of different `component` are not comparable.
+    `frame.up` is [0, 0, 1], and null where gravity is unknown; `frame.units` is "m" for a metric or anchored memory and
+    "unit" for a relative one and a guessed one, where it is about a metre; geometry that an instance lacks is null.
+    Coordinates of instances of different `component` are not comparable.
     """
     components = read_components(store)
     gravity = store.facts.gravity
@@ -60,6 +61,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
             "metric": (store.facts.scale_kind or "relative"),
             "metric_source": store.facts.scale_source,
             "gravity": gravity,
+            **_deviations(store),
         },
         "sessions": _sessions(store),
         "components": [_component(c, len(components)) for c in components if c.chunks or c.instances],
@@ -73,6 +75,13 @@ def scene_dict(store: Store) -> dict[str, Any]:
         "relations": [_relation(r, decimals) for r in relations],
         "aliases": [{"id": k, "instance": v} for k, v in store.ids.aliases().items()],
     }
+
+
+def _deviations(store: Store) -> dict[str, float]:
+    """Return how surely a guessed metre and up are known, where that is known."""
+    deviations = {"metric_deviation": lengths_of(store).deviation}
+    deviations["gravity_deviation_deg"] = store.facts.gravity_deviation_deg
+    return {name: value for name, value in deviations.items() if value is not None}
 
 
 def _length_decimals(store: Store, components: list[Component]) -> int:

@@ -11,6 +11,7 @@ from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.instances.registry import DISCOVERERS
 from list3r.memory.errors import OptionError
 from list3r.memory.store.store import Store
+from list3r.memory.world.held import parse_up
 from list3r.models.cards import ModelCard, find_card, find_weights
 from list3r.models.choice import check_allowed, parse_weights
 from list3r.models.device import find_gpu, pictures_that_fit
@@ -50,7 +51,7 @@ def settings_asked(request: BuildRequest, info: SourceInfo, licence: str) -> tup
     """
     settings, notes = _models_asked(request, info, licence)
     chunks = _cut(settings, request.chunk, request.overlap)
-    return replace(settings, chunks=chunks, depth_every=request.depth_every), notes
+    return replace(settings, chunks=chunks, depth_every=request.depth_every, up=_up_asked(request, settings.up)), notes
 
 
 def settings_resumed(
@@ -63,6 +64,7 @@ def settings_resumed(
         poses=begun.poses if request.poses == default.poses else request.poses,
         depth_every=begun.depth_every if request.depth_every is None else request.depth_every,
         keep_pictures=begun.keep_pictures and request.pictures,
+        up=_up_asked(request, begun.up),
     )
     if any(getattr(request, name) != getattr(default, name) for name in _NAMING):
         named, notes = _models_asked(request, info, licence)
@@ -76,6 +78,14 @@ def settings_resumed(
     if request.chunk is not None or request.overlap is not None:
         settings = replace(settings, chunks=_cut(settings, request.chunk, request.overlap))
     return settings, notes
+
+
+def _up_asked(request: BuildRequest, otherwise: str) -> str:
+    """Return who says which way is up. Raises `OptionError` for what is none."""
+    if request.up is None:
+        return otherwise
+    parse_up(request.up)
+    return request.up
 
 
 def settings_beside(settings: BuildSettings, first: BuildSettings) -> BuildSettings:

@@ -6,11 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+
 from list3r.frames.options import SourceOptions
 from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.library.consolidation import consolidate
+from list3r.memory.library.labels import apply_labels
 from list3r.memory.maintenance.edits import EditReport, scale
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import parse_anchor
+from list3r.memory.world.gravity import Gravity
+from list3r.memory.world.guess import GUESS, guess_metre
+from list3r.memory.world.scale import main_part, parse_anchor, rescale
 from list3r.pipeline.request import Progress, RunOptions, Watch
 from list3r.semantics.detection import DetectReport, detect, open_sources
 
@@ -65,6 +71,7 @@ def finish(report: R, memory: Path, source: str | Path, options: SourceOptions, 
             network = load_detector(run.detector, run.detector_classes)
             seen = name_things(memory, network, str(source), options, watch.looking("names"))
             notes.append(f"{seen.detector} named {len(seen.labels)} things")
+            guess_anew(memory)
     except List3rError as error:
         failure = failure or error
     report = replace(report, notes=tuple(notes))
@@ -77,6 +84,24 @@ def anchor_scale(memory: Path, anchor: str, author: str | None = None) -> EditRe
     """Say how long something in a memory is; return what was edited."""
     with Store.open(memory, writable=True) as store:
         return scale(store, anchor, author)
+
+
+def guess_anew(memory: Path) -> None:
+    """Guess a metre once more where nobody knows one, now that things have names."""
+    with Store.open(memory, writable=True) as store, store.transaction():
+        estimate, before = store.facts.gravity_estimate, store.facts[GUESS]
+        if store.facts.scale_kind not in ("relative", "guessed") or not store.chunks.all():
+            return
+        up, floor = (np.array([0.0, 0.0, 1.0]), None) if estimate is None else (estimate.up, estimate.floor_height)
+        gravity = Gravity(store.facts.gravity, up, floor, "")
+        S_graph_world = store.facts.S_world_graph.inverse()
+        S_graph_chunk = {c.chunk_id: S_graph_world @ c.S_world_chunk for c in store.chunks.all()}
+        found = guess_metre(store, main_part(store.chunks.all()), S_graph_chunk, gravity)
+        if found is None or found == before:
+            return
+        store.facts[GUESS] = found
+        if rescale(store):
+            apply_labels(store, written=consolidate(store).written)
 
 
 def name_things(

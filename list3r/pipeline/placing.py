@@ -23,6 +23,8 @@ from list3r.memory.geometry import Sim3
 from list3r.memory.records import ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.memory.world.gravity import estimate_gravity, world_from_graph
+from list3r.memory.world.guess import GUESS, guess_metre
+from list3r.memory.world.held import parse_up
 from list3r.memory.world.scale import write_scale
 from list3r.memory.world.session_ties import counted_once
 from list3r.pipeline.settings import AssociationSettings, session_settings
@@ -72,18 +74,21 @@ def place_chunks(
         if fitted and metric:
             graph = _as_bent(store, graph, new, how)
     known = {} if store.facts.poses == "given" else graph.covariances
-    settled = store.facts.gravity in ("known", "estimated") or len(chunks) % how.up_again
+    settled = store.facts.gravity != "unknown" or len(chunks) % how.up_again
     if fitted and len(chunks) > how.up_always and settled:
         _place_fitted(store, graph, known)
         return
     stated_up = _stated_up(store, graph, chunks)
     apart = {**graph.components, **{k: k for k in blank}}
-    gravity = estimate_gravity(store, graph.S_graph_chunk, apart, stated_up=stated_up)
+    gravity = estimate_gravity(store, graph.S_graph_chunk, apart, stated_up=stated_up, rule=_rule(store))
     upright = world_from_graph(gravity)
     rows = [replace(c, component=graph.components[c.chunk_id]) for c in chunks]
+    if bend and how.guess_metre:
+        main = [c for c in rows if c.component == min(graph.components.values())]
+        store.facts[GUESS] = guess_metre(store, main, graph.S_graph_chunk, gravity)
     S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
     store.facts.S_world_graph = S_world_graph
-    store.facts.gravity = gravity.status
+    store.facts.gravity, store.facts.gravity_deviation_deg = gravity.status, gravity.deviation_deg
     placed = {c.chunk_id: S_world_graph @ graph.S_graph_chunk[c.chunk_id] for c in chunks}
     store.chunks.place(placed, graph.components, known)
     _place_blank(store, blank)
@@ -208,14 +213,34 @@ def _as_bent(store: Store, graph: GraphResult, new: int, how: AssociationSetting
 
 
 def _stated_up(store: Store, graph: GraphResult, chunks: Sequence[ChunkRow]) -> NDArray[np.float64] | None:
-    """Up in the graph's frame (3,), as chunks say whose frame has z up by their source; None where no source knows."""
-    stating = {s.session_id for s in store.sessions.all() if session_settings(s).up == "source"}
+    """Up in the graph's frame (3,), as chunks say whose frame has z up by their source, or as the user says; None where
+    nobody knows."""
+    asked = {s.session_id: session_settings(s).up for s in store.sessions.all()}
     main = min(graph.components.values(), default=0)
-    rows = [c.chunk_id for c in chunks if c.session_id in stating]
-    ups = [graph.S_graph_chunk[k].rotation[:, 2] for k in rows if graph.components[k] == main]
+    rows = [c for c in chunks if graph.components[c.chunk_id] == main]
+    ups = [graph.S_graph_chunk[c.chunk_id].rotation[:, 2] for c in rows if asked[c.session_id] == "source"]
+    for session, text in asked.items():
+        if text not in ("planes", "source", "camera", "unknown"):
+            first = next((c for c in rows if c.session_id == session), None)
+            ups += [] if first is None else [graph.S_graph_chunk[first.chunk_id].rotation @ _said(store, first, text)]
     total = np.sum(ups, axis=0) if ups else np.zeros(3)
     length = float(np.linalg.norm(total))
     return None if length < 1e-6 else np.asarray(total / length)
+
+
+def _said(store: Store, chunk: ChunkRow, text: str) -> NDArray[np.float64]:
+    """A direction (3,) that a user gave, in a chunk's frame: of the world of given poses, else of its first camera."""
+    up = parse_up(text)
+    assert up is not None
+    T_chunk_cam = next(f.T_chunk_cam for f in store.frames.of(chunk) if f.state == "posed")
+    return up if poses_given(store, chunk.session_id) else np.asarray(T_chunk_cam[:3, :3] @ up)
+
+
+def _rule(store: Store) -> str:
+    """What is to tell up where nobody said it: planes, camera or unknown, as the first session was asked for."""
+    first = min(store.sessions.all(), key=lambda s: s.session_id)
+    rule = session_settings(first).up
+    return rule if rule in ("camera", "unknown") else "planes"
 
 
 def _metre(chunks: Sequence[ChunkRow]) -> float:

@@ -10,6 +10,7 @@ from itertools import pairwise
 from list3r.association.revisits.session_edges import DEFERRED
 from list3r.memory.records import Edge, FrameRow, JsonFields
 from list3r.memory.store.store import Store
+from list3r.pipeline.filming import film_advice
 from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
 
 
@@ -57,6 +58,8 @@ class BuildReport(JsonFields):
     """CPU seconds by stage, over all runs."""
     notes: tuple[str, ...]
     """What the user should know, one sentence each."""
+    film: str | None = None
+    """What kept the video from more and what to do; None where nothing did."""
     live: LiveReport | None = None
     """Of a source that grew while it was built."""
 
@@ -108,6 +111,7 @@ def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
         resumed_chunks=len(plan.done),
         stage_seconds={k: round(v, 2) for k, v in store.chunks.stage_seconds().items()},
         notes=_build_notes(store, plan.session, lost, components),
+        film=film_advice(store, plan.session),
     )
 
 
@@ -192,6 +196,8 @@ def _build_notes(store: Store, session: int, lost: int, components: int) -> tupl
     notes += lost_reasons(store, session)
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
+        if store.facts.gravity != "unknown":
+            notes.append("which way is up is known in the first part alone")
     if store.facts.gravity == "unknown":
         notes.append("which way is up is unknown; vertical relations (on, above, below) are left out")
     return tuple(notes)

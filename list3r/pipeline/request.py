@@ -92,6 +92,14 @@ class BuildRequest:
             "auto|estimate|given|prior",
         ),
     )
+    up: str | None = field(
+        default=None,
+        metadata=option(
+            "Which way is up: camera (as it was held), unknown, or x,y,z: in the world of given poses, else in the "
+            "axes of the first camera (x right, y down, z ahead); default: by surfaces, else as the camera was held.",
+            "camera|x,y,z|unknown",
+        ),
+    )
     chunk: int | None = field(
         default=None, metadata=option("Frames in a chunk; default: 100, with a network as many as the GPU holds.", "N")
     )

@@ -144,6 +144,8 @@ def prepare(
     notes: list[str] = []
     if settings is None or isinstance(settings, BuildRequest):
         request = settings or BuildRequest()
+        if later and request.up in ("camera", "unknown"):
+            raise OptionError(f"--up {request.up} is for build: a memory has one way up; give x,y,z, or leave it out")
         if begun is not None:
             chosen, notes = settings_resumed(request, begun, info, run.licence)
         else:
@@ -371,6 +373,7 @@ def resolve_settings(settings: BuildSettings, info: SourceInfo) -> BuildSettings
         drift = info.poses_drift and info.poses_metric and entry(reconstruction).follows_prior
         poses = ("prior" if drift else "given") if info.has_poses else "estimate"
     up = "source" if info.z_up and poses != "estimate" else "planes"
+    up = up if settings.up in ("planes", "source") else settings.up
     return replace(settings, poses=poses, reconstruction=reconstruction, up=up)
 
 

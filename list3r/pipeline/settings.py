@@ -52,6 +52,8 @@ class AssociationSettings:
     stands until the session is finished: to turn the world is to touch all of it."""
     up_again: int = 32
     """Where up is not known yet it is asked again after so many chunks."""
+    guess_metre: bool = True
+    """Where nobody knows lengths, a metre is guessed at the end of a session."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ class BuildSettings:
     """given, prior (given, but corrected), estimate, or auto: given where the source has them,
     prior where they drift (phones) and the model can correct them."""
     up: str = "planes"
-    """Who says which way is up: planes (level surfaces), or source (given poses of a recorder that knows gravity)."""
+    """Who says which way is up: planes (level surfaces, or the camera where they do not decide), source (given poses
+    of a recorder that knows gravity), camera (as it was held), unknown, or the user: x,y,z, see `BuildRequest.up`."""
     device: str = "auto"
     """Where neural models run: cpu, cuda, or auto, the first GPU where there is one."""
     weights: str | None = None

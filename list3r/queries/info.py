@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from list3r.memory.store.store import Store
+from list3r.memory.world.scale import lengths_of
 
 
 def info(store: Store) -> dict[str, Any]:
@@ -18,9 +19,11 @@ def info(store: Store) -> dict[str, Any]:
         "created_by": store.facts.created_by,
         "scale": store.facts.scale_kind,
         "scale_source": store.facts.scale_source,
+        "metre_deviation": lengths_of(store).deviation,
         "units_per_metre": _guessed_metre(store),
-        "units": "unit" if store.facts.scale_kind == "relative" else "m",
+        "units": lengths_of(store).units,
         "gravity": store.facts.gravity,
+        "gravity_deviation_deg": _rounded(store.facts.gravity_deviation_deg),
         "frames": len(frames),
         **states,
         "chunks": len(chunks),
@@ -39,6 +42,10 @@ def info(store: Store) -> dict[str, Any]:
     }
 
 
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 1)
+
+
 def _guessed_metre(store: Store) -> float | None:
     """Return about how many units a metre is in a memory of relative scale, by depths and the height of the cameras."""
     if store.facts.scale_kind != "relative":
@@ -53,8 +60,9 @@ def describe_counts(store: Store) -> str:
     """Return one line on what a memory holds: instances, structure, sessions, scale and gravity."""
     things, structure = len(store.instances.all(structure=False)), len(store.instances.all(structure=True))
     sessions = len(store.sessions.all())
-    scale = "no scale" if store.facts.scale_kind == "relative" else "metric"
-    up = "up unknown" if store.facts.gravity == "unknown" else "z up"
+    kind, gravity = lengths_of(store), store.facts.gravity
+    scale = {"relative": "no scale", "guessed": "about metres"}.get(kind.metric, "metric")
+    up = {"unknown": "up unknown", "assumed": "z up, assumed"}.get(gravity, "z up")
     counts = (
         f"{things} instance{'s' * (things != 1)}, {structure} of structure, {sessions} session{'s' * (sessions != 1)}"
     )

@@ -81,6 +81,9 @@ def relations(
         (r for r in found if r.confidence >= min_confidence),
         key=lambda r: (-r.confidence, r.subject, r.predicate, r.object),
     )
+    if store.facts.gravity == "assumed" and any(r.predicate in VERTICAL for r in kept):
+        deviation = store.facts.gravity_deviation_deg or 0.0
+        notes.append(f"up is assumed by how the camera was held, give or take {deviation:.0f} degrees")
     return Relations(kept, found.state, "; ".join([*([found.reason] if found.reason else []), *notes]))
 
 
@@ -95,7 +98,7 @@ def relations_of(store: Store, instance_id: int) -> list[Relation]:
 def viewer_from(store: Store, viewpoint: Place) -> Viewpoint | None:
     """Return who looks from a place, see `Place`; None where up is not known. Raises `OptionError` and
     `UnknownIdError`."""
-    upright = store.facts.gravity in ("known", "estimated")
+    upright = store.facts.gravity != "unknown"
     up = np.array([0.0, 0.0, 1.0])
     where = _parse_place(store, viewpoint) if isinstance(viewpoint, str) else viewpoint
     if isinstance(where, PosedCamera):
@@ -154,7 +157,7 @@ def _stored(store: Store, subjects: list[int] | None, predicate: str | None, obj
         for r in found
         if (allowed[0] is None or r.subject in allowed[0]) and (allowed[1] is None or r.object in allowed[1])
     ]
-    if store.facts.gravity not in ("known", "estimated"):
+    if store.facts.gravity == "unknown":
         why = "gravity is unknown in this memory, so on, in, above and under are unknown too"
         if predicate in VERTICAL and not found:
             return Relations([], "unknown", why)

@@ -82,7 +82,7 @@ class _Watch:
         self._store, self._detector, self._sources, self._voting = store, detector, sources, voting
         self._home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
         self._in_session, self._in_chunk = _posed(store)
-        metric = store.facts.scale_kind != "relative"
+        metric = store.facts.scale_kind in ("metric", "anchored")
         self._sizes = {i.id: i.box.size for i in store.instances.all()} if metric else {}
         self._looked: set[tuple[int, int]] = set()
         self.pictures = self.boxes = 0

@@ -56,6 +56,8 @@ class ReadingTools:
         return {
             "memory": shown(m.path.name),
             "units": m.units,
+            "metric": m.lengths.metric,
+            "metre_deviation": m.lengths.deviation,
             "gravity": m.gravity,
             "up": None if m.gravity == "unknown" else "z",
             "instances": len(things),

@@ -34,7 +34,7 @@ def changes(
         alone = not found and len(scene.sessions()) < 2
         notes = ["the memory holds one session; `list3r update` adds a later one to compare with"] if alone else []
         if json:
-            print_answer((_entry(c) for c in found), scene.units, notes)
+            print_answer((_entry(c) for c in found), scene.lengths, notes)
             return
         note(*(f"note: {line}" for line in notes))
         rows = [

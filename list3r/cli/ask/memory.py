@@ -15,6 +15,10 @@ from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
     from list3r.memory.records import DetectedLabel, Instance, Relation
+    from list3r.memory.world.scale import Lengths
+
+_LEFT_OUT = ("beside", "units_per_metre", "metre_deviation", "gravity_deviation_deg")
+"""What is not listed where there is nothing to say."""
 
 
 def info(
@@ -37,19 +41,19 @@ def info(
     with open_memory(memory) as scene:
         report = scene.info()
         chunks = loop_report(scene.store) if loops else {}
-        units = scene.units
+        units = scene.lengths
     if json:
         print_answer([{**report, **chunks}], report.pop("units"))
         return
     for key, value in report.items():
         if key == "units_per_metre" and value is not None:
             say(f"{'a metre is about':20} {value:g} units, by depths and the height of the cameras (a guess)")
-        elif key != "sessions" and (key, value) not in (("beside", None), ("units_per_metre", None)):
+        elif key != "sessions" and (key, value) not in [(name, None) for name in _LEFT_OUT]:
             say(f"{key.replace('_', ' '):20} {', '.join(value) if isinstance(value, list) else value}")
     for session in report["sessions"]:
         say(f"{'session ' + str(session['id']):20} {session['frames']} frames, {session['state']}: {session['source']}")
     if loops:
-        print_loop_report(chunks, units)
+        print_loop_report(chunks, str(units))
 
 
 def list_instances(
@@ -82,7 +86,7 @@ def list_instances(
             from list3r.memory.maintenance.history import world_at
 
             found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
-        units = scene.units
+        units = scene.lengths
     kept = [i for i in found if i.confidence >= least]
     kinds, starts = ("", "scrap", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
     if json:
@@ -110,7 +114,7 @@ def list_instances(
             note(f"{kind} not listed: --min-confidence 0 shows what there is")
 
 
-def _give_or_take(sigma: float | None, units: str) -> str:
+def _give_or_take(sigma: float | None, units: Lengths | str) -> str:
     """How sure a position is, where the memory can tell."""
     return "" if sigma is None else f", give or take {sigma:.2f} {units} against the start"
 
@@ -141,7 +145,7 @@ def show(
         aliases = scene.store.ids.aliases_of(instance.id)
         track = scene.track(instance.id) if instance.dynamic else None
         parts = [{"chunk": o.chunk_id, "local": o.local_id} for o in scene.store.observations.of(instance.id)]
-        units = scene.units
+        units = scene.lengths
         named = scene.store.detected_labels.all().get(instance.id)
         origin = imported_as(scene.store, instance.id)
     if json:
@@ -179,7 +183,7 @@ def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
     return f"{who}; it looks like {instance.description}"
 
 
-def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:
+def _track_lines(times_s: Any, places: Any, units: Lengths | str) -> list[tuple[str, str]]:
     """Fields of a moving thing: when, how far, from where to where."""
     if not len(times_s):
         return [("moved", "seen moving; where it was is not known")]

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory
     from list3r.cli.ask.arguments import CameraArguments
     from list3r.memory.records import BestView, Relation
+    from list3r.memory.world.scale import Lengths
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
     from list3r.queries.views.camera import PosedCamera
@@ -103,7 +104,7 @@ def view_dict(view: BestView | None) -> dict[str, Any] | None:
     return {"session": view.session_id, "frame": view.frame_index, "box_xyxy": list(view.box_xyxy)}
 
 
-def print_matches(matches: Sequence[Match], units: str, json: bool, **facts: Any) -> None:
+def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **facts: Any) -> None:
     """Matches as a table, or as JSON with more facts; what is to be said of all of them goes to standard error."""
     notes, total = getattr(matches, "notes", ()), getattr(matches, "total", None)
     if json:
@@ -113,6 +114,8 @@ def print_matches(matches: Sequence[Match], units: str, json: bool, **facts: Any
     if total is not None and total > len(matches):
         note(f"note: the best {len(matches)} of {total}; -k {total} shows all")
     placed = any(m.distance_m is not None or m.center_distance_m is not None for m in matches)
+    if placed and not isinstance(units, str) and units.deviation is not None:
+        note(f"note: lengths are about metres, a guess, give or take {units.deviation:.0%}")
     rows = [
         [
             m.instance.id,
@@ -131,7 +134,7 @@ def print_matches(matches: Sequence[Match], units: str, json: bool, **facts: Any
 def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
     """Relations with what can be said of the question as a whole."""
     names = {i.id: in_column(i.label or i.description) for i in scene.instances(structure=None)}
-    gravity, units = scene.gravity, scene.units
+    gravity, units = scene.gravity, scene.lengths
     if json:
         notes = [found.reason] if found.reason else []
         print_answer(map(vars, found), units, notes, total=len(found), state=found.state, gravity=gravity)

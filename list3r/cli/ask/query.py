@@ -45,7 +45,7 @@ def nearest(
             encoder=None if near.words is None else scene.word_encoder(),
             **filters.options(),
         )
-        print_matches(matches, scene.units, json)
+        print_matches(matches, scene.lengths, json)
 
 
 def within(
@@ -67,7 +67,7 @@ def within(
         found = scene.within(
             **lengths, camera=seen_by, max_depth=camera.max_depth, occlusion=occlusion, **filters.options()
         )
-        print_matches(found, scene.units, json, total=len(found))
+        print_matches(found, scene.lengths, json, total=len(found))
 
 
 def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False) -> None:
@@ -101,7 +101,7 @@ def similar(
         else:
             assert like.id is not None
             found = scene.similar(like.id, k=k, **filters.options())
-        print_matches(found, scene.units, json)
+        print_matches(found, scene.lengths, json)
 
 
 def find(
@@ -122,7 +122,7 @@ def find(
     Example: list3r query find house.l3r "how many chairs are next to the table?"
     """
     with open_memory(memory) as scene:
-        found, units = scene.find(text, k, viewpoint=viewpoint), scene.units
+        found, units = scene.find(text, k, viewpoint=viewpoint), scene.lengths
     if not json and (found.counted is not None or found.answer is not None):
         say(str(found.counted) if found.counted is not None else str(found.answer))
     print_matches(found, units, json, **found.facts())
@@ -151,7 +151,7 @@ def seen(
             found = scene.visible(camera, max_depth=options.max_depth, structure=structure)
             if camera.frame is not None and not json:
                 note(f"frame {camera.frame.frame_index} of session {camera.session_id}, {camera.frame.time_s:.2f} s")
-            print_matches(found, scene.units, json, total=len(found))
+            print_matches(found, scene.lengths, json, total=len(found))
             return
         assert instance_id is not None
         sightings = scene.seen(instance_id)

@@ -98,7 +98,8 @@ def report_lines(memory: Path, report: BuildReport) -> list[str]:
         f"instances  {report.instances} things, {report.structure} pieces of structure, {report.relations} relations",
         f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
     ]
-    return lines + [f"note: {line}" for line in report.notes]
+    lines += [f"note: {line}" for line in report.notes]
+    return lines if report.film is None else [*lines, report.film]
 
 
 def build_interrupted(memory: Path, resumed: bool) -> Callable[[bool], str]:

@@ -146,7 +146,7 @@ def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool
     from list3r.api import open as open_scene
 
     with open_scene(path, writable=True) as scene:
-        report, units = verb(scene), scene.units
+        report, units = verb(scene), scene.lengths
     if json:
         print_answer([report.as_dict()], units)
         return

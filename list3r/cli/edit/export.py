@@ -47,6 +47,9 @@ class ExportArguments:
     )
     ids: str | None = field(default=None, metadata=option("simready: only these things, such as 3,7,12.", "ID,..."))
 
+    guessed_metre: bool = field(
+        default=False, metadata=option("simready: take a guessed metre for one; lengths and masses are as wrong as it.")
+    )
     workers: int | None = field(
         default=None, metadata=option("simready: worker processes; 0: work in this process.", "N")
     )

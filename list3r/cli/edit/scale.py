@@ -39,10 +39,12 @@ def scale(
             say(f"{report.text} (entry {report.entry})")
     with open_memory(memory) as scene:
         kind, source = (scene.store.facts.scale_kind or "relative"), scene.store.facts.scale_source
-        units = scene.units
+        units = scene.lengths
     if json:
         result = None if anchor is None else report.as_dict()
         print_answer([{"scale": kind, "scale_source": source, "edit": result}], units)
+    elif kind == "guessed":
+        say(f'scale guessed: lengths are about metres ({source}); --anchor "ID=0.095m" makes them metres')
     elif kind == "relative":
         say('scale relative: the length of a unit is unknown; --anchor "ID=0.095m" turns units into metres')
     else:

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from list3r.exporters.components import Component, component_files, has_box, thinned_support
-from list3r.exporters.output import units, write_together
+from list3r.exporters.output import write_together
 from list3r.exporters.palette import instance_color
 from list3r.exporters.plan.loops import loop_ends
 from list3r.exporters.plan.raster import picture_from_above
@@ -30,6 +30,8 @@ from list3r.memory.description.printable import shown
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
+from list3r.memory.world.gravity import gravity_of
+from list3r.memory.world.scale import lengths_of
 
 _INK, _GREY, _LINE = "#262a34", "#787c86", "#cdcfd4"
 _START, _END, _LOOP = "#168c64", "#c43048", "#7654be"
@@ -81,7 +83,7 @@ def plan_figure(store: Store, component: Component, settings: PlanSettings | Non
     share = s.points_of_instances // max(len(component.instances), 1)
     limits = (min(s.points_per_instance, max(share, 1)), s.points_per_structure)
     supports = {i.id: thinned_support(store, i, limits[i.structure is not None]) for i in component.instances}
-    view = choose_view(component, supports, store.facts.gravity)
+    view = choose_view(component, supports, gravity_of(store, component.id))
     instances = [i for i in component.instances if not i.structure and has_box(i)]
     tagged = _seen_most(instances, s.max_tags)
 
@@ -93,7 +95,7 @@ def plan_figure(store: Store, component: Component, settings: PlanSettings | Non
     layers = ([i for i in seen if not i.structure], floors, walls)
     picture = picture_from_above(view, *([supports[i.id] for i in layer] for layer in layers))
     ax.imshow(picture, extent=(view.low[0], view.high[0], view.low[1], view.high[1]), zorder=1)
-    draw_grid(ax, view, units(store))
+    draw_grid(ax, view, str(lengths_of(store)))
     _draw_boxes(ax, view, instances, {i.id for i in tagged})
     _draw_tracks(ax, view, store, component)
     _draw_loops(ax, view, loop_ends(store, component))
@@ -103,7 +105,7 @@ def plan_figure(store: Store, component: Component, settings: PlanSettings | Non
     page.write((_EDGE_PX, 34), _title(store, component), size=17)
     page.write((_EDGE_PX, 60), _subtitle(store, component), size=10, color=_GREY)
     page.write((_EDGE_PX, page.below_map + 44), f"{view.note}; hatched: not seen{remark}", size=10, color=_GREY)
-    _draw_legend(page, instances, units(store))
+    _draw_legend(page, instances, str(lengths_of(store)))
     return page.figure
 
 

@@ -146,7 +146,7 @@ class _SceneWriter:
 
     def __init__(self, memory: SceneMemory, things: Sequence[Instance], settings: PromptSettings) -> None:
         self.memory, self.things, self.settings = memory, things, settings
-        self.per_unit, self.decimals = length_unit(things, memory.units)
+        self.per_unit, self.decimals = length_unit(things, "unit" if memory.lengths.metric == "relative" else "m")
         self.names = {i.id: name_of(i) for i in things}
         self.stored = [r for r in memory.relations() if r.subject in self.names and r.object in self.names]
         self.holders: dict[int, Relation] = {}
@@ -164,8 +164,12 @@ class _SceneWriter:
     def head(self) -> list[str]:
         units, gravity = self.memory.units, self.memory.gravity
         solid = sum(i.structure is None for i in self.things)
+        guess = self.memory.lengths.deviation
         scale = "Lengths: cm." if units == "m" else "Lengths: arbitrary units, the scale is unknown."
-        up = "z is up." if gravity != "unknown" else "Which way is up is unknown, so on and above are left out."
+        if guess is not None:
+            scale = f"Lengths: about cm, the metre is a guess, give or take {guess:.0%}."
+        held = ", assumed by how the camera was held" if gravity == "assumed" else ""
+        up = f"z is up{held}." if gravity != "unknown" else "Which way is up is unknown, so on and above are left out."
         parts = f" {self.parts} parts that are not placed against each other." if self.parts > 1 else ""
         name = shown_between(self.memory.path.name, _SEPARATORS)
         lines = [

@@ -22,6 +22,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store
+from list3r.memory.world.scale import lengths_of
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class SimreadySettings:
     """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
     progress: Callable[[int, int], None] | None = None
     """Called with how many of the things are done, and how many there are."""
+    guessed_metre: bool = False
+    """Take a guessed metre for one; masses then are off by three times its deviation."""
     one_folder: int = 1000
     """Of more props than this a thousand ids share a folder, `from_12000`."""
 
@@ -55,9 +58,11 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
     none.
     """
     folder, settings = Path(folder), settings or SimreadySettings()
-    if units(store) != "m":
+    guessed = lengths_of(store).metric == "guessed"
+    if units(store) != "m" and not (guessed and settings.guessed_metre):
         raise OptionError(
             f"{store.path.name} has no metric scale, which a simulator needs: `list3r scale --anchor` gives it one"
+            + (", --guessed-metre takes the guess" if guessed else "")
         )
     things, structure = _chosen(store, settings)
     parts = len(things) > settings.one_folder

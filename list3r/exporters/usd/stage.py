@@ -121,7 +121,8 @@ def _prepare(stage: Usd.Stage, store: Store) -> Usd.Prim:
         "gravity": store.facts.gravity,
     }
     if facts["units"] != "m":
-        facts["note"] = "the scale of this memory is relative: metersPerUnit 1 is nominal, lengths are not metres"
+        kind = facts["metric"]
+        facts["note"] = f"the scale of this memory is {kind}: metersPerUnit 1 is nominal, lengths are not metres"
     if facts["gravity"] == "unknown":
         facts["gravityNote"] = "the direction of gravity is unknown: upAxis Z is nominal"
     stage.GetRootLayer().customLayerData = {"list3r": facts}

@@ -82,22 +82,26 @@ def _on_faces(points: Array, size: Array, tolerance: float) -> float:
     return float((np.abs(np.abs(sides) - size[:2] / 2.0).min(axis=1) < tolerance).mean())
 
 
-def describe(shape: str, color: str, size: Array, unit: float, *, metric: bool, structure: str | None) -> str:
+def describe(
+    shape: str, color: str, size: Array, unit: float, *, metric: bool, structure: str | None, guessed: bool = False
+) -> str:
     """Return the description of an instance: "small white cylinder, 9 cm".
 
     `shape` is the `shape_word` and `size` (3,) the full edge lengths of its box, world units; `unit` is what a metre is
-    about, also where the memory is not metric, and then no centimetres are given.
+    about, also where the memory is not metric, and then no centimetres are given. Of a guessed metre it is said.
     """
     longest = float(np.max(size))
+    about = "about " if guessed else ""
     if structure is not None:
         what = {"plane": "flat surface"}.get(structure, structure)
-        return _with_size(f"{color} {what}", longest, metric)
+        return _with_size(f"{color} {what}", longest, about, metric)
     metres = longest / unit
     scale = "tiny" if metres < 0.06 else "small" if metres < 0.3 else "medium" if metres < 0.8 else "large"
-    return _with_size(f"long {color} bar" if shape == "bar" else f"{scale} {color} {shape}", longest, metric)
+    return _with_size(f"long {color} bar" if shape == "bar" else f"{scale} {color} {shape}", longest, about, metric)
 
 
-def _with_size(words: str, longest: float, metric: bool) -> str:
+def _with_size(words: str, longest: float, about: str, metric: bool) -> str:
     if not metric:
         return words
-    return f"{words}, {longest * 100:.0f} cm" if longest < 0.995 else f"{words}, {longest:.1f} m"
+    length = f"{longest * 100:.0f} cm" if longest < 0.995 else f"{longest:.1f} m"
+    return f"{words}, {about}{length}"

@@ -86,7 +86,8 @@ def relate(scene: Scene, instances: Iterable[DerivedInstance]) -> list[Relation]
         for component in sorted({b.component for b in there}):
             inside = [b for b in there if b.component == component]
             vertical = scene.world.upright and component == scene.world.first
-            found = relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=measured)
+            sure = scene.world.sure_of_up
+            found = relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=measured, sure_of_up=sure)
             told = (r for r in found if r.subject in subjects or r.object in subjects)
             out |= {(r.subject, r.predicate, r.object): r for r in told}
     return [out[key] for key in sorted(out)]

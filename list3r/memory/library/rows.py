@@ -61,5 +61,5 @@ def _description(
     metric: bool,
 ) -> str:
     color = color_words(found.swatches, names)
-    words = describe(found.shape, color, size, world.unit, metric=metric, structure=structure)
+    words = describe(found.shape, color, size, world.unit, metric=metric, structure=structure, guessed=world.guessed)
     return words if found.resting else f"moving {words}"

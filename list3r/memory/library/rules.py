@@ -24,7 +24,7 @@ from list3r.memory.relations.structure import StructureSettings
 from list3r.memory.settings import stored_settings
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import GravitySettings, floor_height
+from list3r.memory.world.gravity import GravitySettings, floor_height, sure_of_up
 
 _POSED = 80
 """Posed frames from which it does not matter any more how many there are, see `EvidenceSettings.min_share`."""
@@ -112,6 +112,10 @@ class World:
     """Posed frames, counted up to 80: fewer are asked of an instance in a short memory."""
     space: str
     """The embedding space of all chunks; empty where they have several."""
+    sure_of_up: float = 1.0
+    """What relations that need up are as sure as at most."""
+    guessed: bool = False
+    """Whether lengths are guessed metres."""
 
 
 WORLD = Fact[World | None]("library", World, None)
@@ -136,6 +140,8 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         chunks=len(chunks),
         posed=store.frames.posed_count(_POSED),
         space=spaces.pop() if len(spaces) == 1 else "",
+        sure_of_up=sure_of_up(store),
+        guessed=store.facts.scale_kind == "guessed",
     )
 
 

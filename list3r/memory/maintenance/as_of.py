@@ -20,6 +20,7 @@ from list3r.memory.records import Instance, Relation
 from list3r.memory.relations import predicates
 from list3r.memory.relations.instance_geometry import InstanceGeometry
 from list3r.memory.store.store import Store
+from list3r.memory.world.gravity import sure_of_up
 
 _BY_SESSION = ("sessions", "chunks", "frames", "events")
 _BY_CHUNK = ("keyframes", "local_instances", "supports", "placements", "bends", "votes")
@@ -84,7 +85,10 @@ def _found_anew(past: Store, then: Sequence[Instance], changed: set[int], vertic
         instances = [b for i in near if (b := _body(past, i, middle)) is not None]
         settings = settings_of(past, None).relations
         upright = vertical and component == first
-        found = predicates.relations(instances, gravity_known=upright, settings=settings) if moved else []
+        sure = sure_of_up(past)
+        found = (
+            predicates.relations(instances, gravity_known=upright, settings=settings, sure_of_up=sure) if moved else []
+        )
         out += [r for r in found if r.subject in changed or r.object in changed]
     return out
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.memory.geometry import Array, Sim3
+from list3r.memory.records import FrameSamples
 from list3r.memory.store.tables.local_instances import LocalNode
 
 
@@ -26,6 +28,29 @@ class Planes:
     """A sample of all support points, of what is flat and what is not. Shape (N, 3)."""
     owner: NDArray[np.int32] | NDArray[np.int64]
     """Plane of each point, -1 for points of what is not flat. Shape (N,)."""
+    faces: Array | NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Unit normals of a sample of all that looks flat, towards the cameras: computed depth shows few planes, and those
+    bent. None of sensor depth. Shape (S, 3)."""
+
+
+_FACES, _AROUND, _THIN = 1500, 30, 0.1
+"""Places of a chunk that are looked at, points around each, and their least spread over the next of what is flat."""
+
+
+def sampled_faces(samples: FrameSamples) -> NDArray[np.float32]:
+    """Return unit normals, towards the cameras, of a sample of the flat surface that a chunk saw. Shape (S, 3)."""
+    points = samples.points.astype(np.float64)
+    if len(points) < 2 * _AROUND:
+        return np.zeros((0, 3), np.float32)
+    chosen = np.arange(0, len(points), max(1, len(points) // _FACES))
+    around = points[cKDTree(points).query(points[chosen], k=_AROUND)[1]]
+    around -= around.mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    flat = spread[:, 0] < _THIN * spread[:, 1]
+    normal, chosen = axes[flat, :, 0], chosen[flat]
+    eyes = samples.T_chunk_cam[np.searchsorted(samples.camera_frames, samples.frame[chosen]), :3, 3]
+    facing = np.einsum("ni,ni->n", normal, eyes - points[chosen])
+    return np.asarray(normal * np.where(facing < 0, -1.0, 1.0)[:, None], np.float32)
 
 
 def chunk_planes(nodes: Sequence[LocalNode], sample: int = 60) -> Planes:
@@ -68,6 +93,7 @@ def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
         np.concatenate(
             [np.where(p.owner < 0, -1, p.owner.astype(np.int64) + n) for (p, _), n in zip(parts, start, strict=False)]
         ),
+        np.concatenate([p.faces @ S.rotation.T for p, S in parts]),
     )
 
 

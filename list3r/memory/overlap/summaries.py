@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.memory.description.colors import Reference, lab_from_rgb, scene_reference
 from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.metre import metre_by_sight
-from list3r.memory.overlap.planes import Planes, chunk_planes
+from list3r.memory.overlap.planes import Planes, chunk_planes, sampled_faces
 from list3r.memory.overlap.voxels import ChunkShapes, ShapeSettings, chunk_shapes, read_every, with_samples
 from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.settings import stored_settings
@@ -192,7 +192,8 @@ def _summary(store: Store, chunk: ChunkRow, settings: ShapeSettings | None) -> C
     shapes = chunk_shapes(nodes, chunk.image_size, unit, settings, chunk_id=chunk.chunk_id, session_id=chunk.session_id)
     shapes = read_every(shapes, store.sessions.get(chunk.session_id).depth_step or 1)
     if chunk.scale_kind != "metric":
-        shapes = with_samples(shapes, store.chunks.samples(chunk.chunk_id))
+        samples = store.chunks.samples(chunk.chunk_id)
+        shapes, planes = with_samples(shapes, samples), replace(planes, faces=sampled_faces(samples))
     moves = [n.local_id for n in nodes if n.dynamic and not n.structure]
     motions = {n: store.local_instances.motion_track(chunk.chunk_id, n) for n in moves}
     return ChunkSummary(shapes, planes, store.chunks.cannot_links(chunk.chunk_id), unit, motions)

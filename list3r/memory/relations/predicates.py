@@ -15,6 +15,7 @@ The gap is that of the nearest points, without readings amidst an edge, and with
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -47,11 +48,13 @@ def relations(
     unit: float = 1.0,
     settings: RelationSettings | None = None,
     measured: PairMeasures | None = None,
+    sure_of_up: float = 1.0,
 ) -> list[Relation]:
     """Return all relations among instances, in the order of (subject, predicate, object).
 
     `unit` is what a metre is in world units (1 for a metric memory). Instances of different components have none.
-    `measured` holds what was found for the same instances, unit and settings before.
+    `measured` holds what was found for the same instances, unit and settings before. What needs up is as sure as
+    `sure_of_up` at most.
     """
     s = settings or RelationSettings()
     instances = sorted(instances, key=lambda b: b.id)
@@ -71,6 +74,7 @@ def relations(
             out += _both(instances, predicate, found)
         out += _overhead(scene, support)
         out += _attached(scene, {a for a, _, _, _ in (*inside, *supported)})
+        out = [replace(r, confidence=round(r.confidence * sure_of_up, 4)) for r in out]
     out += _beside(scene, support, gravity_known)
     return sorted(out, key=lambda r: (r.subject, r.predicate, r.object))
 

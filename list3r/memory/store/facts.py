@@ -48,13 +48,16 @@ class Facts:
     created_by = Fact[str | None]("created_by", str, None)
     """The program that made it, with its version."""
     scale_kind = Fact[str | None]("scale_kind", str, None)
-    """metric, anchored or relative; None before anything said so."""
+    """metric, anchored, guessed or relative; None before anything said so."""
     scale_source = Fact[str | None]("scale_source", str, None)
     """Who says how long a unit is."""
     metres_per_graph_unit = Fact[float | None]("metres_per_graph_unit", float, None)
     """Metres in a unit of the pose graph; None where it is one unit of the world."""
     gravity = Fact[str]("gravity", str, "unknown")
-    """known, estimated (z is up in both) or unknown."""
+    """known, estimated by surfaces, assumed by how the camera was held (z is up in all three), or unknown. It holds for
+    the first part of a memory alone."""
+    gravity_deviation_deg = Fact[float | None]("gravity_deviation_deg", float, None)
+    """Of z from up; None where a recorder knew it or nobody does."""
     gravity_estimate = Fact[UpEstimate | None]("gravity_estimate", UpEstimate, None)
     """Which way is up and where the floor is, in the frame of the pose graph."""
     poses = Fact[str | None]("poses", str, None)

@@ -1,6 +1,6 @@
 """How long a unit is: metric where a sensor or given poses say so, anchored where an operator knows one length.
 
-Otherwise it is relative: the length of a unit is unknown.
+Otherwise it is guessed (`guess`), or relative where nothing tells: the length of a unit is unknown.
 
 An anchor is kept as an edit, in metres per unit of one chunk, which nothing changes: whatever later chunks, loops and
 sessions do to the graph, the world is scaled so that lengths in that chunk stay what the operator said.
@@ -21,6 +21,7 @@ from list3r.memory.geometry import Array, Sim3
 from list3r.memory.overlap.summaries import cameras_of
 from list3r.memory.records import ChunkRow
 from list3r.memory.store.store import Store
+from list3r.memory.world.guess import GUESS
 
 _WANTED = "give ID=0.095m, ID.height=0.095m, camera_height=1.5m or x,y,z:x,y,z=1.2m"
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "": 1.0}
@@ -46,11 +47,34 @@ class WorldScale:
     """What a unit of the pose graph is."""
 
     kind: str
-    """metric, anchored or relative."""
+    """metric, anchored, guessed or relative."""
     source: str | None
     """Who says so, None to leave what was said."""
     metres: float | None
     """Metres in a unit of the graph; None where it is one unit of the world, as in metric and relative memories."""
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """In what lengths of a memory are told."""
+
+    units: str
+    """m, or unit where nobody knows a length; one is about a metre where `metric` is guessed."""
+    metric: str
+    """metric, anchored, guessed or relative."""
+    deviation: float | None
+    """Of a guessed metre, as a share of it."""
+
+    def __str__(self) -> str:
+        """The unit for people."""
+        return "about m" if self.metric == "guessed" else self.units
+
+
+def lengths_of(store: Store) -> Lengths:
+    """Return in what lengths are told."""
+    kind, guess = store.facts.scale_kind or "relative", store.facts[GUESS]
+    deviation = None if guess is None or kind != "guessed" else round(guess.deviation, 3)
+    return Lengths("m" if kind in ("metric", "anchored") else "unit", kind, deviation)
 
 
 @dataclass(frozen=True)
@@ -91,7 +115,7 @@ def parse_anchor(text: str) -> ScaleAnchor:
 
 def measure(store: Store, anchor: ScaleAnchor) -> MeasuredAnchor:
     """Return how long the anchor is now. Raises `OptionError` and `UnknownIdError` where it cannot be measured."""
-    chunks = _main_part(store.chunks.all())
+    chunks = main_part(store.chunks.all())
     if not chunks:
         raise OptionError(f"{store.path} has no chunk yet; there is nothing to measure")
     if store.facts.scale_kind == "metric":
@@ -118,8 +142,9 @@ def write_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
 
 
 def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int, Sim3]) -> WorldScale:
-    """Return what a unit of the graph is: by the chunks that are metric, else by the last anchor that stands."""
-    inside = _main_part(chunks)
+    """Return what a unit of the graph is: by the chunks that are metric, else by the last anchor that stands, else by
+    the guess."""
+    inside = main_part(chunks)
     metric = [c.chunk_id for c in inside if c.scale_kind == "metric"]
     source = store.facts.scale_source
     if inside and len(metric) == len(inside):
@@ -133,13 +158,16 @@ def world_scale(store: Store, chunks: list[ChunkRow], S_graph_chunk: Mapping[int
             chunk_id, metres = edit.scale
             factor = metres / float(S_graph_chunk[chunk_id].scale)
             return WorldScale("anchored", f"{edit.text}, by {edit.author}", factor)
+    guess = store.facts[GUESS]
+    if guess is not None and inside:
+        return WorldScale("guessed", f"a guess, give or take {guess.deviation:.0%}, by {guess.source}", guess.metres)
     return WorldScale("relative", "none", None)
 
 
-def rescale(store: Store) -> None:
-    """Scale the world by the anchors that stand now; nothing where they say what they said before.
+def rescale(store: Store) -> bool:
+    """Scale the world by the anchors that stand now, or the guess; nothing where they say what they said before.
 
-    Writes where chunks lie; the library is to be derived again then.
+    Writes where chunks lie; the library is to be derived again then. Returns whether they lie otherwise.
     """
     chunks = store.chunks.all()
     S_world_graph = store.facts.S_world_graph
@@ -147,7 +175,7 @@ def rescale(store: Store) -> None:
     grow = write_scale(store, chunks, {c.chunk_id: S_graph_world @ c.S_world_chunk for c in chunks})
     factor = float(grow.scale) / float(S_world_graph.scale)
     if abs(factor - 1.0) < 1e-12:
-        return
+        return False
     S_new_old = Sim3(np.asarray(factor), np.eye(3), np.zeros(3))
     store.facts.S_world_graph = S_new_old @ S_world_graph
     store.chunks.place(
@@ -155,9 +183,10 @@ def rescale(store: Store) -> None:
         {c.chunk_id: c.component for c in chunks},
         {c.chunk_id: c.covariance for c in chunks if c.covariance is not None},
     )
+    return True
 
 
-def _main_part(chunks: list[ChunkRow]) -> list[ChunkRow]:
+def main_part(chunks: list[ChunkRow]) -> list[ChunkRow]:
     """Return the chunks of the part whose unit is the memory's."""
     first = min((c.component for c in chunks), default=0)
     return [c for c in chunks if c.component == first]
