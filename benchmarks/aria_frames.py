@@ -35,7 +35,7 @@ SEGMENTS = "400-1"
 SIDE = 640
 """Pictures are compared at this width and height."""
 LEAST_SHARE = 150 / (320 * 240)
-NO_THINGS = ("part of a cabinet/wardrobe", "shelter")
+NO_OBJECTS = ("part of a cabinet/wardrobe", "shelter")
 """Categories of what is no thing of its own."""
 
 
@@ -97,7 +97,7 @@ def compared(
     """Recall and precision by masks, and what is best for each true thing."""
     px = np.sum([np.bincount(t.ravel(), minlength=len(names) + 1) for t in truth.values()], axis=0)
     large = [k for k in names if px[k] >= LEAST_SHARE * SIDE**2]
-    wanted = [k for k in large if names[k] not in NO_THINGS]
+    wanted = [k for k in large if names[k] not in NO_OBJECTS]
     shared = np.zeros((len(found), len(names) + 1), np.int64)
     own = np.zeros(len(found), np.int64)
     for row, masks in enumerate(found.values()):

@@ -51,9 +51,9 @@ def main() -> None:
         "frames": asked.frames,
     }
     result |= {"size": list(asked.size), "runs": runs}
-    told = asked.json or asked.folder / "batch.json"
-    if asked.runs and told.exists():
-        runs |= json.loads(told.read_text())["runs"]
+    report = asked.json or asked.folder / "batch.json"
+    if asked.runs and report.exists():
+        runs |= json.loads(report.read_text())["runs"]
     print(f"{asked.videos} videos of {asked.frames} frames and one file that is no video")
     reference: dict[str, str] | None = None
     for name, engine, jobs in _runs(asked.engines):
@@ -68,10 +68,10 @@ def main() -> None:
             found = _run(command, out, kills, random.Random(asked.seed))
         hashes = _hashes(out)
         reference = reference or hashes
-        found |= {"files": len(hashes), "equal": hashes == reference, **_told(out)}
+        found |= {"files": len(hashes), "equal": hashes == reference, **_report(out)}
         runs[name] = found
         print(name, json.dumps(found), flush=True)
-        write_json(told, result)
+        write_json(report, result)
 
 
 def _runs(engines: list[str]) -> Iterator[tuple[str, str, list[str]]]:
@@ -159,7 +159,7 @@ def _hashes(out: Path) -> dict[str, str]:
     return {p.name: file_hash(p) for p in sorted(out.glob("*.l3r"))}
 
 
-def _told(out: Path) -> dict[str, object]:
+def _report(out: Path) -> dict[str, object]:
     """What the manifest says: tasks by state, and how often any was built."""
     with contextlib.closing(sqlite3.connect(out / "batch.sqlite")) as database:
         states = dict(database.execute("SELECT state, count(*) FROM tasks GROUP BY state").fetchall())

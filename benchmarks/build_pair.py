@@ -96,7 +96,7 @@ def _figures(memory: Path, source: Path, truth: Trajectory | None, count: int) -
     exported = memory.with_suffix(".json")
     with open_memory(memory) as opened:
         opened.export("json", str(exported))
-    things = [e for e in read_scene(exported)["instances"] if not e["structure"]]
+    objects = [e for e in read_scene(exported)["instances"] if not e["structure"]]
     with Store.open(memory) as store:
         poses = {f.frame_index: (S.rotation, S.translation) for f, S in store.trajectory.poses()}
     if truth is None:
@@ -104,7 +104,7 @@ def _figures(memory: Path, source: Path, truth: Trajectory | None, count: int) -
         error = errors["ate_se3_m"]["rmse"]
     else:
         error = sim3_error(truth, poses)
-    return {"frames": count, "posed": len(poses), "ate_m": round(error, 5), "instances": len(things)}
+    return {"frames": count, "posed": len(poses), "ate_m": round(error, 5), "instances": len(objects)}
 
 
 def _commit(root: Path) -> str:

@@ -32,7 +32,7 @@ from list3r.catalog.records import (
     CatalogAnswers,
     CatalogError,
     CatalogFilters,
-    CatalogThing,
+    CatalogInstance,
     MemoryContent,
     MemoryEntry,
     SpaceVectors,
@@ -95,26 +95,26 @@ class Growth:
         self._vectors: list[list[Vectors]] = []
         self._backend = open_backend(url)
         self._catalog = Catalog(self._backend)
-        told = ("instances", "dimension", "questions")
+        report = ("instances", "dimension", "questions")
         self._result: dict[str, Any] = {"database": "PostgreSQL" if server else "SQLite", "stages": []}
-        self._result |= {"a_memory": {name: getattr(asked, name) for name in told}}
+        self._result |= {"a_memory": {name: getattr(asked, name) for name in report}}
 
     def run(self) -> None:
         for count in map(int, self._asked.stages.split(",")):
             self._result["stages"].append(self._stage(count))
-            self._told()
+            self._report()
         if self._asked.files:
             self._result["from_files"] = self._from_files()
-            self._told()
+            self._report()
         if self._asked.busy_s:
             self._result["busy"] = self._busy()
-            self._told()
+            self._report()
         if self._server is not None:
             self._result["killed"] = self._killed(self._server)
-            self._told()
+            self._report()
         self._catalog.close()
 
-    def _told(self) -> None:
+    def _report(self) -> None:
         print(list(self._result.items())[-1], "load", round(os.getloadavg()[0], 1), flush=True)
         write_json(self._asked.json, self._result)
 
@@ -347,12 +347,12 @@ def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.rand
     """A memory of things of random places, names, looks and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
-    things = []
+    instances = []
     for n in range(count):
         label, color = KINDS[kinds[n]], COLORS[colors[n]]
         box = OrientedBox(centers[n], sizes[n], np.eye(3))
-        told = (label, f"{color} box, 20 cm", "present", None, float(chance.uniform(0.3, 1.0)), 0.01, 1, box)
-        things.append(CatalogThing(name, n, *told, {label: 100, color: 90, "box": 80}))
+        report = (label, f"{color} box, 20 cm", "present", None, float(chance.uniform(0.3, 1.0)), 0.01, 1, box)
+        instances.append(CatalogInstance(name, n, *report, {label: 100, color: 90, "box": 80}))
     pairs = chance.integers(0, count, (2 * count, 2))
     relations = [
         (int(a), "on" if k % 2 else "near", int(b), 0.8, 0.1) for k, (a, b) in enumerate(np.unique(pairs, axis=0))
@@ -361,7 +361,7 @@ def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.rand
         name, f"/nowhere/{name}.l3r", 0, f"{chance.integers(2**60):x}", 1, 0, "metric", "known", count, 1
     )
     spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in looks.items()]
-    return MemoryContent(entry, things, relations, spaces)
+    return MemoryContent(entry, instances, relations, spaces)
 
 
 @contextlib.contextmanager

@@ -66,9 +66,9 @@ def _run(walk: Path, memory: Path, name: str) -> dict[str, Any]:
     errors = _answer("eval", "trajectory", str(walk), str(memory))
     found = _answer("eval", "instances", str(walk / "truth.json"), str(memory))
     sha256 = seal(memory, memory.with_suffix(".sealed"), ("benchmark",), "walk")
-    told = {"chunks": report["chunks"], "instances": report["instances"], "ate_m": errors["ate_se3_m"]["rmse"]}
+    figures = {"chunks": report["chunks"], "instances": report["instances"], "ate_m": errors["ate_se3_m"]["rmse"]}
     scores = {k: found["instances_0.25"][k] for k in ("matched", "true_count", "precision", "recall")}
-    return {"wall_s": round(wall_s, 1), "command_cpu_s": round(own_s, 1), "ended": kills, **told, **scores} | {
+    return {"wall_s": round(wall_s, 1), "command_cpu_s": round(own_s, 1), "ended": kills, **figures, **scores} | {
         "sha256": sha256
     }
 

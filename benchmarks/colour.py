@@ -216,7 +216,7 @@ def scene_errors(memory: Path, walk: Path) -> dict[str, Any]:
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     boxes = evaluate_scene(scene, true_scene, S_truth_world)
     by_masks, found = _by_masks(overlaps, scene, true_scene)
-    out = {"ate_sim3_m": round(ate, 4), "things_scale": _things_scale(scene, true_scene, found, S_truth_world)}
+    out = {"ate_sim3_m": round(ate, 4), "things_scale": _objects_scale(scene, true_scene, found, S_truth_world)}
     out |= by_masks
     for name in ("0.25", "0.50"):
         entry = boxes[f"instances_{name}"]
@@ -239,7 +239,7 @@ def _alignment(memory: Path, walk: Path) -> tuple[Sim3, float]:
     return S, float(np.sqrt(np.square(position_errors(true, estimate, S)).mean()))
 
 
-def _things_scale(
+def _objects_scale(
     scene: Mapping[str, Any], truth: Mapping[str, Any], found: list[tuple[int, int, float]], S_truth_world: Sim3
 ) -> float | None:
     """Scale from the memory's world to the truth's by the middles of things, over that by the cameras."""
@@ -284,12 +284,12 @@ def compare_masks(truth: Masks, found: Masks) -> Overlaps:
     row, column = ({k: n for n, k in enumerate(each)} for each in (true_ids, ids))
     shared = np.zeros((len(true_ids), len(ids)), np.int64)
     true_px, px = np.zeros(len(true_ids), np.int64), np.zeros(len(ids), np.int64)
-    for frame, things in truth.items():
-        for t, mask in things.items():
+    for frame, objects in truth.items():
+        for t, mask in objects.items():
             true_px[row[t]] += mask.sum()
         for e, other in found[frame].items():
             px[column[e]] += other.sum()
-            for t, mask in things.items():
+            for t, mask in objects.items():
                 shared[row[t], column[e]] += (mask & other).sum()
     return Overlaps(true_ids, ids, shared, true_px, px)
 
@@ -301,9 +301,9 @@ def _by_masks(
     (true id, id, IoU) at IoU 0.25.
     """
     wanted = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= LEAST_PX}
-    things = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
+    objects = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
     rows = [n for n, k in enumerate(overlaps.true_ids) if k in wanted]
-    columns = [n for n, k in enumerate(overlaps.ids) if k in things and overlaps.px[n] > 0]
+    columns = [n for n, k in enumerate(overlaps.ids) if k in objects and overlaps.px[n] > 0]
     iou = overlaps.iou()[np.ix_(rows, columns)]
     out: dict[str, Any] = {"things": len(columns), "true_things": len(rows)}
     pairs: list[tuple[int, int]] = []
@@ -312,7 +312,7 @@ def _by_masks(
         out[f"mask_recall_{threshold:.2f}"] = round(len(pairs) / max(len(rows), 1), 3)
         out[f"mask_precision_{threshold:.2f}"] = round(len(pairs) / max(len(columns), 1), 3)
     found = [(overlaps.true_ids[rows[r]], overlaps.ids[columns[c]], float(iou[r, c])) for r, c in pairs]
-    out |= _false_things(overlaps, columns, found, truth)
+    out |= _false_objects(overlaps, columns, found, truth)
     judged = relations_of_matches(scene, truth, found).by_predicate
     for name, entry in judged.items():
         out[f"{name}_recall"], out[f"{name}_precision"] = (
@@ -321,7 +321,7 @@ def _by_masks(
     return out, found
 
 
-def _false_things(
+def _false_objects(
     overlaps: Overlaps, columns: list[int], found: list[tuple[int, int, float]], truth: Mapping[str, Any]
 ) -> dict[str, int]:
     """How many things that match nothing lie mostly on structure, on a thing that is found, and on one that is not."""

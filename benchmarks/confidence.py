@@ -229,8 +229,8 @@ def left_out(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
         apart = set(places[part::FOLDS])
         weights = fitted([r for r in rows if r["place"] not in apart])
         for r in (r for r in rows if r["place"] in apart):
-            told = [weights.probability(Signs(**i["signs"])) for i in r["instances"]]
-            said = [i | {"confidence": c} for i, c in zip(r["instances"], told, strict=True)]
+            report = [weights.probability(Signs(**i["signs"])) for i in r["instances"]]
+            said = [i | {"confidence": c} for i, c in zip(r["instances"], report, strict=True)]
             out.append(r | {"instances": said})
     return {k: summary([r for r in out if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}
 

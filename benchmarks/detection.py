@@ -67,15 +67,15 @@ def judged(path: Path) -> dict[str, Any]:
     """What the true things are called, and what else bears their names."""
     with Store.open(path) as store:
         home = instances_of(store)
-        things = {i.id: i for i in store.instances.all(structure=None)}
+        objects = {i.id: i for i in store.instances.all(structure=None)}
         wanted = {name: TRUTH[name][0] for name in TRUTH}
-        said = {name: None if home[name] is None else things[home[name]].label for name in TRUTH}
+        said = {name: None if home[name] is None else objects[home[name]].label for name in TRUTH}
         others: dict[str, int] = {}
-        for i in things.values():
+        for i in objects.values():
             if i.label is not None and i.id not in home.values():
                 others[i.label] = others.get(i.label, 0) + 1
         poses = store.facts.poses
-        structure = sum(i.label is not None for i in things.values() if i.structure is not None)
+        structure = sum(i.label is not None for i in objects.values() if i.structure is not None)
     with list3r.open(path) as memory:
         first = {match.instance.id for match in memory.find("cup on dining table")[:2]}
     mugs = {home["white mug"], home["printed mug"]}

@@ -173,7 +173,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
     T_chunk_world = _laid_by_cameras(film, views)
     frame = _upright(T_chunk_world.rotation @ np.array([0.0, 0.0, 1.0]))
     stride, structural = views.stride, {t.id for t in film.things if t.structure}
-    true, told, pairs = _Gathered(), _Gathered(), []
+    true, report, pairs = _Gathered(), _Gathered(), []
     said: dict[int, tuple[float, str, float]] = {}
     right = claimed = there = 0
     for proposals in found:
@@ -196,13 +196,13 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
             mine,
             views.small_depth(proposals.position) > 0,
         )
-        told.add(points, _without_skirts(theirs, views, view), view.confirmed)
+        report.add(points, _without_skirts(theirs, views, view), view.confirmed)
         pairs.append(np.stack([mine[view.confirmed], theirs[view.confirmed]], axis=1))
     pixels, large = np.concatenate(pairs), true.large(MIN_PX)
     wanted = list(true.boxes(MIN_PX).values())
     faint = [box for value, box in true.boxes().items() if value not in large]
     of_faint = _of_faint(pixels, large)
-    boxes = [box for value, box in told.boxes_of_supports().items() if value not in of_faint]
+    boxes = [box for value, box in report.boxes_of_supports().items() if value not in of_faint]
     out: dict[str, Any] = {"true": len(wanted), "structure": [int(right), int(claimed), int(there)]}
     for threshold in (0.25, 0.5):
         kept = _without_faint(wanted, faint, boxes, threshold)
@@ -255,11 +255,11 @@ def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
 def _mask_ious(pairs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """True things (T,), found ones (E,), and the IoU of their pixels over all views (T, E)."""
     true, at = np.unique(pairs[:, 0], return_inverse=True)
-    told, to = np.unique(pairs[:, 1], return_inverse=True)
-    shared = np.zeros((len(true), len(told)))
+    report, to = np.unique(pairs[:, 1], return_inverse=True)
+    shared = np.zeros((len(true), len(report)))
     np.add.at(shared, (at, to), 1)
     union = shared.sum(axis=1, keepdims=True) + shared.sum(axis=0, keepdims=True) - shared
-    return true[true >= 0], told[told >= 0], (shared / union)[true >= 0][:, told >= 0]
+    return true[true >= 0], report[report >= 0], (shared / union)[true >= 0][:, report >= 0]
 
 
 class _Gathered:
@@ -335,26 +335,26 @@ def _as_sure_as_right(
     true thing at 0.25: [probability of its name, whether it is right]; the house's makers call things otherwise.
     """
     best: dict[int, tuple[float, int]] = {}
-    true, told, iou = _mask_ious(pairs)
-    for column, number in enumerate(told.tolist()):
+    true, report, iou = _mask_ious(pairs)
+    for column, number in enumerate(report.tolist()):
         row = int(iou[:, column].argmax()) if len(true) else 0
         best[number] = (float(iou[row, column]), int(true[row])) if len(true) else (0.0, -1)
     whole, names = [], []
     for number, (score, name, probability) in sorted(said.items()):
-        share, thing = best.get(number, (0.0, -1))
-        if share >= 0.25 and thing not in large:
+        share, obj = best.get(number, (0.0, -1))
+        if share >= 0.25 and obj not in large:
             continue
         whole.append([score, int(share >= 0.5)])
-        if share >= 0.25 and labels[thing + 1] in LABELS:
-            names.append([probability, int(labels[thing + 1] == name)])
+        if share >= 0.25 and labels[obj + 1] in LABELS:
+            names.append([probability, int(labels[obj + 1] == name)])
     return {"whole": whole, "names": names}
 
 
 def _of_faint(pairs: NDArray[np.int64], large: set[int]) -> set[int]:
     """Estimates of which most pixels show one thing that was hardly in view: neither right nor wrong."""
     codes, count = np.unique(pairs[pairs[:, 1] >= 0], axis=0, return_counts=True)
-    best = {int(told): int(true) for true, told in codes[np.argsort(count, kind="stable")].tolist()}
-    return {told for told, true in best.items() if true >= 0 and true not in large}
+    best = {int(report): int(true) for true, report in codes[np.argsort(count, kind="stable")].tolist()}
+    return {report for report, true in best.items() if true >= 0 and true not in large}
 
 
 def _without_faint(

@@ -35,7 +35,7 @@ from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_sur
 from list3r.instances.learned.network import classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.superpoints import cut_superpoints
-from list3r.instances.learned.things import classify_things
+from list3r.instances.learned.verdicts import classify_segments
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.library import select_prompts
 from training.samples import chunk_settings, voxel_truth
@@ -110,14 +110,14 @@ def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, 
     discoverer = LearnedDiscoverer(settings, weights)
     out: dict[str, dict[str, Any]] = {}
 
-    def told(cut: Callable[[int], Proposals]) -> dict[str, Any]:
+    def scores(cut: Callable[[int], Proposals]) -> dict[str, Any]:
         return figures(film, views, [select_prompts(cut(p), settings) for p in views.anchors])
 
     true = TrueDiscoverer(film)
-    out["true"] = told(lambda p: true(frames, reconstruction, p))
+    out["true"] = scores(lambda p: true(frames, reconstruction, p))
     for name, (labels, flat) in rungs(chunk, weights).items():
-        out[name] = told(lambda p, labels=labels, flat=flat: proposed(discoverer, chunk, labels, flat, p))
-    out["listed"] = told(lambda p: discoverer(frames, reconstruction, p))
+        out[name] = scores(lambda p, labels=labels, flat=flat: proposed(discoverer, chunk, labels, flat, p))
+    out["listed"] = scores(lambda p: discoverer(frames, reconstruction, p))
     forget_views()
     return out
 
@@ -143,15 +143,15 @@ def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np
     g = pieces.graph
     first = agglomerate(len(g.nodes), g.left, g.right, classify(weights, "fine", g).affinity, g.weight, s.sure)
     out["parts"] = named(chunk, majority(chunk, pieces.joined(first)))
-    parts, coarse, told = join_parts(surface, pieces, weights, s)
+    parts, coarse, scores = join_parts(surface, pieces, weights, s)
     out["joined"] = named(chunk, majority(chunk, parts))
-    at = lambda end: agglomerate(len(coarse.nodes), coarse.left, coarse.right, told.affinity, coarse.weight, end)  # noqa: E731
+    at = lambda end: agglomerate(len(coarse.nodes), coarse.left, coarse.right, scores.affinity, coarse.weight, end)  # noqa: E731
     out["tree"] = best_of(chunk, [parts, *(np.append(at(e), -1)[parts] for e in ENDS)])
     own = at(s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
     out["cut"] = best_of(chunk, [labels])
-    verdicts = classify_things(weights, own, coarse, told)
+    verdicts = classify_segments(weights, own, coarse, scores)
     free = verdicts.structure <= 0.5
     out["bound"] = best_of(chunk, [np.where(np.append(free, False)[labels], labels, -1)])
     out["unlisted"] = labels, ~free
@@ -170,11 +170,11 @@ def majority(chunk: Chunk, labels: Labels) -> NDArray[np.int32]:
     known = labels >= 0
     codes, votes = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
     order = np.lexsort((votes, codes >> 16))
-    thing = np.full(int(labels.max(initial=-1)) + 2, -1, np.int32)
-    thing[codes[order] >> 16] = codes[order] & 0xFFFF
-    thing[thing == 0] = -1
-    thing[-1] = -1
-    return thing[labels]
+    obj = np.full(int(labels.max(initial=-1)) + 2, -1, np.int32)
+    obj[codes[order] >> 16] = codes[order] & 0xFFFF
+    obj[obj == 0] = -1
+    obj[-1] = -1
+    return obj[labels]
 
 
 def best_of(chunk: Chunk, groupings: list[NDArray[np.int32]]) -> tuple[Labels, NDArray[np.bool_]]:
@@ -185,17 +185,17 @@ def best_of(chunk: Chunk, groupings: list[NDArray[np.int32]]) -> tuple[Labels, N
         known = labels >= 0
         count = np.bincount(labels[known])
         codes, shared = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
-        cluster, thing = codes >> 16, codes & 0xFFFF
-        iou = shared / (count[cluster] + size[thing] - shared)
-        rows = (thing > 0) & (iou >= FITS)
-        fits = (iou[rows].tolist(), cluster[rows].tolist(), thing[rows].tolist())
+        cluster, obj = codes >> 16, codes & 0xFFFF
+        iou = shared / (count[cluster] + size[obj] - shared)
+        rows = (obj > 0) & (iou >= FITS)
+        fits = (iou[rows].tolist(), cluster[rows].tolist(), obj[rows].tolist())
         found += [(share, level, k, t) for share, k, t in zip(*fits, strict=True)]
     ids, done = np.full(len(chunk.truth), -1, np.int32), set()
-    for _, level, cluster, thing in sorted(found, key=lambda e: (-e[0], e[1], e[2])):
+    for _, level, cluster, obj in sorted(found, key=lambda e: (-e[0], e[1], e[2])):
         mine = groupings[level] == cluster
-        if thing not in done and (ids[mine] < 0).all():
-            ids[mine] = thing
-            done.add(thing)
+        if obj not in done and (ids[mine] < 0).all():
+            ids[mine] = obj
+            done.add(obj)
     return named(chunk, ids)
 
 

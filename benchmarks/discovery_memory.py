@@ -98,11 +98,11 @@ def write_film(root: Path, film: Film, seed: int) -> None:
     write_tum(root / "cameras.txt", Trajectory(film.time_s, film.T_world_cam))
     boxes, largest = true_boxes(film)
     entries = []
-    for thing in film.things:
-        entry: dict[str, Any] = {"id": thing.id, "label": thing.label, "structure": thing.structure}
-        entry["largest_px"] = largest.get(thing.id, 0)
-        if thing.id in boxes:
-            box = boxes[thing.id]
+    for obj in film.things:
+        entry: dict[str, Any] = {"id": obj.id, "label": obj.label, "structure": obj.structure}
+        entry["largest_px"] = largest.get(obj.id, 0)
+        if obj.id in boxes:
+            box = boxes[obj.id]
             turn = quat_wxyz_from_rotation(box.rotation).tolist()
             entry["box"] = {"center": box.center.tolist(), "size": box.size.tolist(), "quat_wxyz": turn}
             entries.append(entry)
@@ -122,8 +122,8 @@ def true_boxes(film: Film) -> tuple[dict[int, Any], dict[int, int]]:
         seen = np.where(film.depth[k] > 0, film.ids[k], 0).astype(np.int64)
         ids.append(seen[::2, ::2] - 1)
         area = np.bincount(seen.ravel())
-        for thing in np.flatnonzero(area).tolist():
-            largest[thing] = max(largest.get(thing, 0), int(area[thing]))
+        for obj in np.flatnonzero(area).tolist():
+            largest[obj] = max(largest.get(obj, 0), int(area[obj]))
     return {k + 1: box for k, box in gathered_boxes(points, ids).items()}, largest
 
 
@@ -178,14 +178,14 @@ def by_masks(overlaps: Overlaps, scene: dict[str, Any], truth: dict[str, Any]) -
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Figures over all walks, each thing counting the same."""
     total = lambda key: sum(int(r[key]) for r in rows)  # noqa: E731
-    things = max(total("true"), 1)
+    objects = max(total("true"), 1)
     out: dict[str, Any] = {"walks": len(rows), "things": total("true")}
     for tag in ("0.25", "0.5"):
         for kind in ("", "mask_"):
-            out[f"{kind}recall_{tag}"] = round(total(f"{kind}found_{tag}") / things, 3)
+            out[f"{kind}recall_{tag}"] = round(total(f"{kind}found_{tag}") / objects, 3)
             out[f"{kind}precision_{tag}"] = round(total(f"{kind}found_{tag}") / max(total(f"{kind}listed_{tag}"), 1), 3)
     for key in ("duplicates", "merged", "split", "joined", "on_structure"):
-        out[f"{key}_per_thing"] = round(total(key) / things, 3)
+        out[f"{key}_per_thing"] = round(total(key) / objects, 3)
     return out
 
 

@@ -129,8 +129,8 @@ def write_memory(path: Path, count: int) -> None:
         chunks = []
         for index, first in enumerate(range(0, max(count, 1), IN_CHUNK)):
             ids = range(first + 1, min(count, first + IN_CHUNK) + 1)
-            instances = [thing(n, rng) for n in ids]
-            local = tuple(local_thing(k, i, 10 * index, rng) for k, i in enumerate(instances))
+            instances = [make_object(n, rng) for n in ids]
+            local = tuple(local_instance(k, i, 10 * index, rng) for k, i in enumerate(instances))
             chunk = store.chunks.add(session, chunk_of(index, local))
             chunks.append(chunk)
             store.instances.put(instances)
@@ -143,7 +143,7 @@ def write_memory(path: Path, count: int) -> None:
         store.sessions.complete(session)
 
 
-def thing(n: int, rng: np.random.Generator) -> Instance:
+def make_object(n: int, rng: np.random.Generator) -> Instance:
     """A table, or a thing on the table before it."""
     place, k = divmod(n - 1, 7)
     room = np.array([2.0 * (place % 200), 2.0 * (place // 200), 0.0])
@@ -170,7 +170,7 @@ def thing(n: int, rng: np.random.Generator) -> Instance:
     )
 
 
-def local_thing(k: int, i: Instance, frame: int, rng: np.random.Generator) -> LocalInstance:
+def local_instance(k: int, i: Instance, frame: int, rng: np.random.Generator) -> LocalInstance:
     """What a chunk saw of it: points on its box, a mask in one frame."""
     unit = rng.uniform(-0.5, 0.5, (POINTS, 3))
     axis = rng.integers(0, 3, POINTS)

@@ -45,8 +45,8 @@ def main() -> None:
     else:
         old, returns = map(int, words.seeds.split(","))
         result = {p: simulated(p, returns if p in RETURNS.split(",") else old) for p in words.presets.split(",")}
-    for name, told in result.items():
-        print(name, told)
+    for name, report in result.items():
+        print(name, report)
     write_json(words.json, {"likeness": result})
 
 
@@ -62,8 +62,8 @@ def simulated(preset: str, seed: int) -> dict[str, Any]:
     errors = FeedForwardSettings.unseen_home(preset == "halls") if later else FeedForwardSettings()
     rows = np.arange(0, len(video.time_s), 5)
     model = FeedForwardModel(video, errors, seed=seed)
-    told = figures(rows, seen_share(video, rows, rows, MOST_DEG), model.descriptors[rows].astype(np.float64))
-    return told | {"seed": seed, "masks": masks(video, model)}
+    report = figures(rows, seen_share(video, rows, rows, MOST_DEG), model.descriptors[rows].astype(np.float64))
+    return report | {"seed": seed, "masks": masks(video, model)}
 
 
 def masks(video: Any, model: Any) -> dict[str, Any]:
@@ -73,10 +73,10 @@ def masks(video: Any, model: Any) -> dict[str, Any]:
 
     span = plan_chunks(len(video.time_s), ChunkSettings(), ())[0]
     library = model.chunk(span).library
-    things = {t.id for t in video.world.things if t.structure is None}
+    objects = {t.id for t in video.world.objects if t.structure is None}
     ids = video.ids[span.start : span.stop]
     size = np.bincount(ids.ravel())
-    known = [k for k in sorted(things) if k < len(size) and size[k] >= LEAST_PX]
+    known = [k for k in sorted(objects) if k < len(size) and size[k] >= LEAST_PX]
     tracks = [i.track for i in library.instances if not i.structure and not i.dynamic]
     held = np.zeros((len(tracks), len(size)))
     for row, track in zip(held, tracks, strict=True):
@@ -84,8 +84,8 @@ def masks(video: Any, model: Any) -> dict[str, Any]:
             row += np.bincount(ids[frame - span.start][decode_mask(runs, track.image_size)], minlength=len(size))
     iou = held / (held.sum(axis=1, keepdims=True) + size - held)
     most = held.argmax(axis=1)
-    own = np.isin(most, sorted(things))
-    second = np.sort(np.where(np.isin(np.arange(len(size)), sorted(things)), held, 0.0), axis=1)[:, -2]
+    own = np.isin(most, sorted(objects))
+    second = np.sort(np.where(np.isin(np.arange(len(size)), sorted(objects)), held, 0.0), axis=1)[:, -2]
     merged = own & (second >= 0.25 * held.sum(axis=1))
     further = own.sum() - len(np.unique(most[own]))
     return {

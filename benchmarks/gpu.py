@@ -177,10 +177,10 @@ def measure_tracker(name: str, objects: list[int], tiny: bool, device: torch.dev
         _save_tracker(name, Path(folder), tiny)
         tracker = VideoTracker(name, Path(folder), str(device))
     rows = []
-    tracker(frames[:4], _first(reconstruction, 4), [_grid_of_things(1)], "none")  # the first pass loads kernels
+    tracker(frames[:4], _first(reconstruction, 4), [_grid_of_objects(1)], "none")  # the first pass loads kernels
     for count in objects:
         started = time.perf_counter()
-        tracker(frames, reconstruction, [_grid_of_things(count)], "none")
+        tracker(frames, reconstruction, [_grid_of_objects(count)], "none")
         rows.append({"objects": count, "ms_per_frame": round(1e3 * (time.perf_counter() - started) / len(frames), 2)})
     slope, base = np.polyfit([r["objects"] for r in rows], [r["ms_per_frame"] for r in rows], 1)
     return {
@@ -240,7 +240,7 @@ def _first(made: Reconstruction, count: int) -> Reconstruction:
     )
 
 
-def _grid_of_things(count: int) -> Proposals:
+def _grid_of_objects(count: int) -> Proposals:
     """So many rectangles on the first frame."""
     side = int(np.ceil(np.sqrt(count)))
     rows, columns = np.meshgrid(np.arange(240) * side // 240, np.arange(320) * side // 320, indexing="ij")

@@ -45,9 +45,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     if args.list:
-        told = before_after.run_list(args.json)
-        print(before_after.table(told))
-        raise SystemExit(1 if before_after.open_rows(told) else 0)
+        report = before_after.run_list(args.json)
+        print(before_after.table(report))
+        raise SystemExit(1 if before_after.open_rows(report) else 0)
     parts: dict[str, tuple[Callable[[Path, int, int], Batch], int]] = {
         "damages": (damages.batch, args.damages),
         "command lines": (command_lines.batch, args.command_lines),
@@ -56,9 +56,9 @@ def main() -> None:
     problems = 0
     if args.bombs:
         with tempfile.TemporaryDirectory() as folder:
-            told = bombs.run_bombs(Path(folder))
-        Run(args.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(told)
-        problems += len(told["problems"])
+            report = bombs.run_bombs(Path(folder))
+        Run(args.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(report)
+        problems += len(report["problems"])
     for key, (work, count) in parts.items():
         if count:
             problems += len(_part(key, work, count, args)["problems"])
@@ -70,9 +70,9 @@ def _part(key: str, work: Callable[[Path, int, int], Batch], count: int, args: a
     run = Run(args.json, key, {"tries": batches * EACH, "seed": args.seed})
     with tempfile.TemporaryDirectory(dir=_fast_folder()) as folder:
         run.go(functools.partial(work, Path(folder), args.seed), batches, args.processes)
-    told = run.finish()
-    print(key, json.dumps(told, indent=2), flush=True)
-    return told
+    report = run.finish()
+    print(key, json.dumps(report, indent=2), flush=True)
+    return report
 
 
 def _fast_folder() -> str | None:

@@ -263,9 +263,9 @@ def chunk(k: int, name: str, seed: int) -> ChunkResult:
     error = rng.normal(0.0, 0.005, 3)
     place = place_of(k, name)
     frames = np.arange(HOP * k, HOP * k + FRAMES)
-    things = [thing(n, STEP * place + n, seed, error, frames, rng) for n in range(SEEN)]
-    things.append(floor(SEEN, place, name, error, frames, rng))
-    links = np.array([(a, b) for a in range(len(things)) for b in range(a)], np.int32)
+    objects = [make_object(n, STEP * place + n, seed, error, frames, rng) for n in range(SEEN)]
+    objects.append(floor(SEEN, place, name, error, frames, rng))
+    links = np.array([(a, b) for a in range(len(objects)) for b in range(a)], np.int32)
     T_chunk_cam = np.stack([camera(int(f), name, error) for f in frames])
     samples = samples_of(k, frames, T_chunk_cam, name, seed, error)
     return ChunkResult(
@@ -282,7 +282,7 @@ def chunk(k: int, name: str, seed: int) -> ChunkResult:
             keyframe(int(f), place, seed, T) for f, T in zip(frames, T_chunk_cam, strict=True) if f % 7 == 0
         ),
         samples=samples,
-        library=LocalLibrary(tuple(things), links, SPACE),
+        library=LocalLibrary(tuple(objects), links, SPACE),
     )
 
 
@@ -342,7 +342,7 @@ def keyframe(frame: int, place: int, seed: int, T_chunk_cam: np.ndarray) -> Keyf
     )
 
 
-def thing(
+def make_object(
     local_id: int, number: int, seed: int, error: np.ndarray, frames: np.ndarray, rng: np.random.Generator
 ) -> LocalInstance:
     """Thing `number` of the way, always the same: a box that stands on the floor."""

@@ -304,11 +304,11 @@ def kill_edits(memory: Path, kills: int, seed: int = 0) -> Result:
     rng = random.Random(seed)
     problems: list[str] = []
     for n in range(kills):
-        told = _killed([str(Path(__file__).resolve()), "--edit", str(memory), str(seed * 1000 + n)], rng, 0.5)
+        report = _killed([str(Path(__file__).resolve()), "--edit", str(memory), str(seed * 1000 + n)], rng, 0.5)
         problems += judge(memory, 0)
         with Store.open(memory) as store:
             entries = {e.entry for e in store.edits.all()}
-        lost = sorted(set(told) - entries)
+        lost = sorted(set(report) - entries)
         if lost:
             problems.append(f"edits {lost} were committed and are lost")
         problems += _underived(memory)

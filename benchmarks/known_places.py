@@ -69,13 +69,13 @@ class KnownPlaces:
         came = {t for k, t in found if k == "added" and t not in known}
         return found - {("added", t) for t in came if not any(v.sees_empty(now[t]) for v in self._visits[:n])}
 
-    def _empty(self, n: int, thing: Thing) -> bool:
+    def _empty(self, n: int, obj: Thing) -> bool:
         """Whether a visit sees that a thing is not where it was: the place is empty, or something else has it."""
-        if self._visits[n].sees_empty(thing):
+        if self._visits[n].sees_empty(obj):
             return True
-        at, half = (np.array(thing["box"][k]) for k in ("center", "size"))
-        others = [e for t, e in self.scenes[n].items() if t != thing["id"] and e["largest_px"] >= MIN_PX]
-        gone = is_elsewhere(thing, self.scenes[n].get(thing["id"]))
+        at, half = (np.array(obj["box"][k]) for k in ("center", "size"))
+        others = [e for t, e in self.scenes[n].items() if t != obj["id"] and e["largest_px"] >= MIN_PX]
+        gone = is_elsewhere(obj, self.scenes[n].get(obj["id"]))
         return gone and any((np.abs(np.array(e["box"]["center"]) - at) < half / 2).all() for e in others)
 
 
@@ -89,15 +89,15 @@ class _Visit:
         ]
         self._camera = np.loadtxt(walk / "calibration.txt").reshape(-1)[:4]
 
-    def sees_empty(self, thing: Thing) -> bool:
+    def sees_empty(self, obj: Thing) -> bool:
         """Whether frames see through the place of a thing."""
-        seen = sum(self._sees_through(thing, T, depth) for T, depth in self._frames)
+        seen = sum(self._sees_through(obj, T, depth) for T, depth in self._frames)
         return seen >= _LEAST_FRAMES
 
-    def _sees_through(self, thing: Thing, T_cam_world: NDArray[np.float64], depth: NDArray[np.float32]) -> bool:
+    def _sees_through(self, obj: Thing, T_cam_world: NDArray[np.float64], depth: NDArray[np.float32]) -> bool:
         fx, fy, cx, cy = self._camera
-        center, size = (np.array(thing["box"][k]) for k in ("center", "size"))
-        turned = Rotation.from_quat(thing["box"]["quat_wxyz"], scalar_first=True)
+        center, size = (np.array(obj["box"][k]) for k in ("center", "size"))
+        turned = Rotation.from_quat(obj["box"]["quat_wxyz"], scalar_first=True)
         p = (center + turned.apply(_GRID * size)) @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
         if (p[:, 2] < 0.3).any():
             return False

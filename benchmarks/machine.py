@@ -143,5 +143,5 @@ STARTED_AT = commit()
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
     """Write a result beside the machine and the commit that it was measured on; temporary folders are not named."""
     if path is not None:
-        told = json.dumps({"machine": machine(), "commit": STARTED_AT, **result}, indent=2)
-        path.write_text(re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+", "...", told) + "\n", encoding="utf-8")
+        written = json.dumps({"machine": machine(), "commit": STARTED_AT, **result}, indent=2)
+        path.write_text(re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+", "...", written) + "\n", encoding="utf-8")

@@ -35,7 +35,7 @@ from list3r.instances.learned.discovery import LearnedSettings
 from list3r.instances.learned.graph import chunk_surface
 from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs
 from list3r.instances.learned.pieces import cut_pieces
-from list3r.instances.learned.things import first_verdicts, names_of, thing_features
+from list3r.instances.learned.verdicts import first_verdicts, names_of, segment_features
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import SegmentSettings
 from training.graphs import surroundings_of
@@ -190,9 +190,9 @@ def listed(sample: Sample) -> dict[str, NDArray[Any]]:
     cloud = sample.cloud(SegmentSettings().grain_m(sensed=not sample.computed))
     truth = sample.truth_of(cloud).astype(np.int64)
     surface = chunk_surface(cloud, sample.views, surroundings_of(sample))
-    parts, graph, told = join_parts(surface, cut_pieces(surface), weights, CutSettings())
-    own = agglomerate(len(graph.nodes), graph.left, graph.right, told.affinity, graph.weight, CutSettings().enough)
-    structure, x = thing_features(own, graph, told)
+    parts, graph, scores = join_parts(surface, cut_pieces(surface), weights, CutSettings())
+    own = agglomerate(len(graph.nodes), graph.left, graph.right, scores.affinity, graph.weight, CutSettings().enough)
+    structure, x = segment_features(own, graph, scores)
     whole, names = first_verdicts(weights, x)
     cluster = np.append(own, -1)[parts]
     shared = np.zeros((len(x), int(truth.max()) + 1))
@@ -215,9 +215,9 @@ def summary(rows: Sequence[Named]) -> dict[str, Any]:
         p = np.concatenate(said)
         entry: dict[str, Any] = {**calibration(p, right)}
         for t in LEAST:
-            told = p >= t
-            share = round(float(told[nameable].mean()), 3)
-            entry[f"from_{t:g}"] = {"named": int(told.sum()), "wrong": int((told & ~right).sum()), "coverage": share}
+            named = p >= t
+            share = round(float(named[nameable].mean()), 3)
+            entry[f"from_{t:g}"] = {"named": int(named.sum()), "wrong": int((named & ~right).sum()), "coverage": share}
         out[word] = entry
     return out
 

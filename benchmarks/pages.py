@@ -62,15 +62,15 @@ def measure(page: Browser, report: Path) -> dict[str, Any]:
     used, began = cpu_seconds(page), time.monotonic()
     page.open(report.as_uri())
     page.wait(lambda: page.run(f"document.readyState === 'complete' && {ROWS} > 0"), 300)
-    told: dict[str, Any] = {
+    row: dict[str, Any] = {
         "open_s": round(time.monotonic() - began, 2),
         "open_cpu_s": round(cpu_seconds(page) - used, 2),
     }
-    told["heap_mb"] = round(page.run("performance.memory.usedJSHeapSize") / 1e6)
-    told["search_ms"] = {word: round(page.run(SEARCH % word)) for word in ("zzz", "#77", "stuhl", "plant on table", "")}
+    row["heap_mb"] = round(page.run("performance.memory.usedJSHeapSize") / 1e6)
+    row["search_ms"] = {word: round(page.run(SEARCH % word)) for word in ("zzz", "#77", "stuhl", "plant on table", "")}
     page.run(SEARCH % "stuhl")
-    told["found"] = page.run("document.getElementById('count').textContent")
-    return {**told, "load_average": round(os.getloadavg()[0], 1), "console_errors": page.errors}
+    row["found"] = page.run("document.getElementById('count').textContent")
+    return {**row, "load_average": round(os.getloadavg()[0], 1), "console_errors": page.errors}
 
 
 if __name__ == "__main__":

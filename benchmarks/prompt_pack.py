@@ -1,6 +1,6 @@
 """How many questions scene.md answers as the memory does, by budget of tokens and size of the memory.
 
-    python benchmarks/prompt_pack.py [MEMORY ...] [--things 10 100 1000 5000] [--questions 200] [--out FILE.json]
+    python benchmarks/prompt_pack.py [MEMORY ...] [--objects 10 100 1000 5000] [--questions 200] [--out FILE.json]
 
 A plain program reads nothing but the text. It is asked which thing is nearest to one, what holds it, how many of a name
 there are, how far two things are apart and in which direction. `general` is one text for all questions; `asked` is a
@@ -52,11 +52,11 @@ class Question:
 def questions(memory: SceneMemory, count: int) -> Iterator[Question]:
     """Questions with their answers, of all kinds in turn."""
     rng = np.random.default_rng(0)
-    things = memory.instances()
+    objects = memory.instances()
     held = [(r.subject, r.object) for p in SUPPORTING for r in memory.relations(predicate=p)]
     names = Counter(name_of(i) for i in memory.instances(structure=None))
     for n in range(count):
-        a, b = (things[k] for k in rng.choice(len(things), 2, replace=False))
+        a, b = (objects[k] for k in rng.choice(len(objects), 2, replace=False))
         kind = KINDS[n % len(KINDS)]
         if kind == "nearest":
             near = memory.nearest(a.id, k=2)
@@ -191,14 +191,14 @@ def measure(memory: SceneMemory, count: int) -> list[dict[str, Any]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("memories", nargs="*", type=Path)
-    parser.add_argument("--things", nargs="*", type=int, default=[10, 100, 1000, 5000])
+    parser.add_argument("--objects", nargs="*", type=int, default=[10, 100, 1000, 5000])
     parser.add_argument("--questions", type=int, default=200)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         paths = list(options.memories)
-        for count in options.things:
+        for count in options.objects:
             paths.append(Path(folder) / f"made-{count}.l3r")
             made_memory(paths[-1], count)
         for path in paths:

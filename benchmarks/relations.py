@@ -45,7 +45,7 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.queries.relations import VERTICAL
 from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
 from list3r.simulation.worlds.gaps import surface_gap
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
@@ -79,9 +79,9 @@ def main() -> None:
         print(f"{name:16} {pooled[name]}")
     vertical = sum(r["vertical_without_gravity"] for r in rows)
     print(f"vertical relations without gravity: {vertical}")
-    things = statistics.fmean(r["things"] for r in rows)
+    objects = statistics.fmean(r["things"] for r in rows)
     print(machine())
-    write_json(args.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": things, "seeds": rows})
+    write_json(args.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": objects, "seeds": rows})
 
 
 def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
@@ -92,8 +92,8 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
     truth = _truth(walk)
     memory.unlink(missing_ok=True)
     with Store.create(memory) as store:
-        told = build(store, walk, truth, poses)
-        truth_of = _most_common(store, told)
+        report = build(store, walk, truth, poses)
+        truth_of = _most_common(store, report)
         claimed = [(r.subject, r.predicate, r.object) for r in store.relations.all()]
         kept = {i for i, e in truth.items() if e["frames_seen"] >= MIN_FRAMES and e["largest_px"] >= MIN_PX}
         matched = {k: v for k, v in truth_of.items() if v in kept}
@@ -138,15 +138,15 @@ def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str
         store.facts.scale_kind = "metric"
         store.facts.poses = poses
         session = store.sessions.add(str(walk), "", {"poses": poses}, source.info.frame_count)
-    told: dict[tuple[int, int], int] = {}
+    report: dict[tuple[int, int], int] = {}
     for span in plan_chunks(source.info.frame_count, settings.chunks):
         discoverer = ToldMasks(walk, truth, settings.instances)
         result = process_parts(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)[-1]
         chunk = add_chunk(store, session, result)
         for instance in result.library.instances:
-            told[chunk, instance.local_id] = _true_id(walk, instance.track)
+            report[chunk, instance.local_id] = _true_id(walk, instance.track)
     finish_session(store, session)
-    return told
+    return report
 
 
 class ToldMasks:
@@ -166,8 +166,8 @@ class ToldMasks:
         present = [int(k) for k in np.flatnonzero(area >= 20) if int(k) in self._truth]
         labels = np.zeros(ids.shape, np.int32)
         features = []
-        for number, thing in enumerate(present):
-            mask = ids == thing
+        for number, obj in enumerate(present):
+            mask = ids == obj
             labels[mask] = number + 1
             small = mask[:: views.stride, :: views.stride] & view.confirmed
             up = -view.T_chunk_cam[:3, 1]
@@ -208,11 +208,11 @@ def _true_id(walk: Path, track: Any) -> int:
     return votes.most_common(1)[0][0]
 
 
-def _most_common(store: Store, told: dict[tuple[int, int], int]) -> dict[int, int]:
+def _most_common(store: Store, report: dict[tuple[int, int], int]) -> dict[int, int]:
     """True id of every global instance; of several instances of one thing the one with most observations counts."""
     votes: dict[int, Counter[int]] = {}
     for seen in store.observations.all():
-        votes.setdefault(seen.instance_id, Counter())[told[seen.chunk_id, seen.local_id]] += 1
+        votes.setdefault(seen.instance_id, Counter())[report[seen.chunk_id, seen.local_id]] += 1
     best: dict[int, tuple[int, int]] = {}
     for instance, counter in sorted(votes.items()):
         true, count = counter.most_common(1)[0]
@@ -223,10 +223,10 @@ def _most_common(store: Store, told: dict[tuple[int, int], int]) -> dict[int, in
 
 def _close_calls(seed: int) -> set[tuple[int, int]]:
     """Pairs of things of which nobody who measures to a few centimetres can say whether they are next to each other."""
-    things = [t for t in WalkSettings(seed=seed).world().things if t.structure is None]
+    objects = [t for t in WalkSettings(seed=seed).world().objects if t.structure is None]
     close = set()
-    for a in things:
-        for b in things:
+    for a in objects:
+        for b in objects:
             if a.id != b.id:
                 limit = float(np.clip(0.25 * (a.box().size.max() + b.box().size.max()), *NEXT_TO_M))
                 if abs(limit - surface_gap(a, b)) < CLOSE_M:
@@ -236,35 +236,35 @@ def _close_calls(seed: int) -> set[tuple[int, int]]:
 
 def _without(triples: list[Triple], torn: set[tuple[int, int]], truth_of: dict[int, int] | None = None) -> list[Triple]:
     """The triples less what is not asked: on what things stand that are half on a rug, and whether they are near it."""
-    things = {thing for thing, _ in torn}
-    pairs = torn | {(rug, thing) for thing, rug in torn}
+    objects = {obj for obj, _ in torn}
+    pairs = torn | {(rug, obj) for obj, rug in torn}
     named = [(s, o) if truth_of is None else (truth_of.get(s), truth_of.get(o)) for s, _, o in triples]
     return [
         t
         for t, (s, o) in zip(triples, named, strict=True)
-        if not (t[1] == "on" and s in things) and not (t[1] == "near" and (s, o) in pairs)
+        if not (t[1] == "on" and s in objects) and not (t[1] == "near" and (s, o) in pairs)
     ]
 
 
 def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
     """Things that stand with some feet on a rug and with some beside it, neither being the answer; with the rug."""
-    things = WalkSettings(seed=seed).world().things
+    objects = WalkSettings(seed=seed).world().objects
     torn = set()
-    for rug_id, rug in ((t.id, t.box()) for t in things if t.label == "rug"):
-        for thing in things:
-            feet = [b for b in part_boxes(thing) if b.center[2] - b.size[2] / 2 < 0.05]
-            if thing.structure is None and thing.label != "rug" and feet:
+    for rug_id, rug in ((t.id, t.box()) for t in objects if t.label == "rug"):
+        for obj in objects:
+            feet = [b for b in part_boxes(obj) if b.center[2] - b.size[2] / 2 < 0.05]
+            if obj.structure is None and obj.label != "rug" and feet:
                 away = [np.abs((b.center - rug.center) @ rug.rotation)[:2] - rug.size[:2] / 2 for b in feet]
                 over = [bool((a < 0).all()) for a in away]
                 if any(over) and not all(over):
-                    torn.add((thing.id, rug_id))
+                    torn.add((obj.id, rug_id))
     return torn
 
 
-def part_boxes(thing: SimulatedThing) -> list[OrientedBox]:
+def part_boxes(obj: SimulatedObject) -> list[OrientedBox]:
     """The box of each part of a thing in the world."""
-    rotation, position = thing.rotation(), np.array(thing.position)
-    corners = [part.extent() for part in thing.parts]
+    rotation, position = obj.rotation(), np.array(obj.position)
+    corners = [part.extent() for part in obj.parts]
     return [OrientedBox(position + rotation @ ((low + high) / 2), high - low, rotation) for low, high in corners]
 
 

@@ -41,7 +41,7 @@ from list3r.queries.within import within
 SPACE = "synthetic@1/256"
 DIMENSION = 256
 ROOM_M = np.array([5.0, 5.0, 3.0])
-THINGS = 30
+OBJECTS = 30
 BATCH = 20_000
 COLORS = "white black grey red orange yellow green teal blue purple brown pink".split()
 SHAPES = "box cylinder sheet slab panel object table sphere".split()
@@ -170,7 +170,7 @@ def leave_cache(path: Path) -> None:
 
 def rooms(count: int) -> Floats:
     """Extent of the world: rooms in a square, one floor. Shape (3,)."""
-    side = int(np.ceil(np.sqrt(np.ceil(count / THINGS))))
+    side = int(np.ceil(np.sqrt(np.ceil(count / OBJECTS))))
     return np.array([side, side, 1.0]) * ROOM_M
 
 
@@ -186,17 +186,17 @@ def write_memory(path: Path, count: int, seed: int) -> float:
             ids = np.arange(first, min(first + BATCH, count + 1))
             rng = np.random.default_rng([seed, first])
             with store.transaction():
-                store.instances.put(things(ids, side, rng))
+                store.instances.put(objects(ids, side, rng))
                 store.embeddings.put(SPACE, ids.tolist(), features(len(ids), seed, rng))
                 store.relations.replace(
-                    [], [Relation(int(n), "near", int(n) - 1, 0.9, 0.1) for n in ids if n % THINGS != 1]
+                    [], [Relation(int(n), "near", int(n) - 1, 0.9, 0.1) for n in ids if n % OBJECTS != 1]
                 )
     return round(time.perf_counter() - started, 1)
 
 
-def things(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Iterator[Instance]:
+def objects(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Iterator[Instance]:
     """Boxes of 5 cm to 2 m, small ones the most, anywhere in their room and turned about the vertical."""
-    room = (ids - 1) // THINGS
+    room = (ids - 1) // OBJECTS
     corner = np.stack([room % side, room // side, np.zeros_like(room)], axis=1) * ROOM_M
     size = 0.05 * 40.0 ** (rng.uniform(size=(len(ids), 3)) ** 2)
     center = corner + rng.uniform(0.0, 1.0, size.shape) * (ROOM_M - np.minimum(size, ROOM_M)) + size / 2
@@ -260,13 +260,13 @@ def views(stored: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.f
 
 def one_more_chunk(store: Store, n: int, count: int) -> None:
     """What the store writes when a chunk has changed 30 things of one room and found 5 new ones."""
-    first = 1 + THINGS * (n % max(1, count // THINGS))
-    changed = list(range(first, min(first + THINGS, count)))
+    first = 1 + OBJECTS * (n % max(1, count // OBJECTS))
+    changed = list(range(first, min(first + OBJECTS, count)))
     new = [store.ids.next() + k for k in range(5)]
     rng = np.random.default_rng(n)
     side = int(rooms(count)[0] / ROOM_M[0] + 0.5)
     with store.transaction():
-        store.instances.put(things(np.array(changed + new), side, rng))
+        store.instances.put(objects(np.array(changed + new), side, rng))
         store.embeddings.put(SPACE, changed + new, features(len(changed) + 5, 1, rng))
         store.relations.replace(changed, [Relation(a, "near", a - 1, 0.9, 0.1) for a in changed[1:]])
 

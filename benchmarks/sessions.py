@@ -138,19 +138,19 @@ def measure(before: Store, after: Store, walks: Sequence[Path], due: Due | None 
     now = {e: t for t, e, _ in second["matched_ids"]}
     due = due or Due.of(scenes)
     done = due.changes
-    unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
+    unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {obj for _, obj in done}]
     kept = sum(now.get(after.ids.resolve(i)) == t for i, t in unchanged)
-    told = {_told(e, was, now, due.scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
-    told -= due.besides
-    wrong = sorted((k, t) for k, t in told - done)
+    claimed = {_report(e, was, now, due.scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
+    claimed -= due.besides
+    wrong = sorted((k, t) for k, t in claimed - done)
     known = {t for t in was.values()} | {t for k, t in done if k == "added"}
     return {
         "placed_m": round(moved_m, 4),
         "placed_deg": round(turned_deg, 3),
         "unchanged": len(unchanged),
         "ids_kept": kept,
-        "events": {k: _counts(told, done, k) for k in KINDS},
-        "missed": sorted((k, t, t in known) for k, t in done - told),
+        "events": {k: _counts(claimed, done, k) for k in KINDS},
+        "missed": sorted((k, t, t in known) for k, t in done - claimed),
         "false": wrong,
         "false_removed_unseen": sum(k == "removed" and _unseen(scenes[1], t) for k, t in wrong),
         "first": things_found(first),
@@ -187,7 +187,7 @@ def is_elsewhere(a: dict[str, Any], b: dict[str, Any] | None) -> bool:
     return float(np.linalg.norm(np.subtract(*places))) > ELSEWHERE_M
 
 
-def _told(
+def _report(
     event: ChangeEvent,
     was: dict[int, int],
     now: dict[int, int],
@@ -215,17 +215,17 @@ def _there(box: OrientedBox | None, scene: dict[str, Any], S_truth_world: Sim3, 
     if box is None:
         return None
     at = S_truth_world.apply(box.center[None])[0]
-    things = [e for e in scene["instances"] if not e["structure"]]
-    off = [float(np.linalg.norm(np.array(e["box"]["center"]) - at)) for e in things]
-    return int(things[int(np.argmin(off))]["id"]) if off and min(off) <= most_m else None
+    objects = [e for e in scene["instances"] if not e["structure"]]
+    off = [float(np.linalg.norm(np.array(e["box"]["center"]) - at)) for e in objects]
+    return int(objects[int(np.argmin(off))]["id"]) if off and min(off) <= most_m else None
 
 
-def _unseen(scene: dict[str, Any], thing: int) -> bool:
-    return any(e["id"] == thing and e["largest_px"] == 0 for e in scene["instances"])
+def _unseen(scene: dict[str, Any], obj: int) -> bool:
+    return any(e["id"] == obj and e["largest_px"] == 0 for e in scene["instances"])
 
 
-def _counts(told: set[tuple[str, int]], done: set[tuple[str, int]], kind: str) -> dict[str, int]:
-    said, true = ({t for k, t in s if k == kind} for s in (told, done))
+def _counts(claimed: set[tuple[str, int]], done: set[tuple[str, int]], kind: str) -> dict[str, int]:
+    said, true = ({t for k, t in s if k == kind} for s in (claimed, done))
     return {"hit": len(said & true), "false": len(said - true), "missed": len(true - said)}
 
 
@@ -285,8 +285,8 @@ def redkitchen(root: Path, source: Path, workers: str, cut: int = 500) -> dict[s
         again = [k for k in small if k in events and events[k].kind == "seen_again"]
         gone = [k for k in small if store.ids.resolve(k) != k]
     changed = [(e.kind, k) for k, e in events.items() if e.kind in KINDS]
-    small_things = {"small": len(small), "small_seen_again": len(again), "small_aliased": len(gone)}
-    return {**report["events"], "placed": report["placed"], **usage, **small_things, "false": changed}
+    small_objects = {"small": len(small), "small_seen_again": len(again), "small_aliased": len(gone)}
+    return {**report["events"], "placed": report["placed"], **usage, **small_objects, "false": changed}
 
 
 if __name__ == "__main__":

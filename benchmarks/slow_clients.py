@@ -48,21 +48,21 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     args = parser.parse_args()
-    told: dict[str, Any] = {"slow_clients": args.clients, "seconds": args.seconds}
+    report: dict[str, Any] = {"slow_clients": args.clients, "seconds": args.seconds}
     with tempfile.TemporaryDirectory() as folder, _service(Path(folder)) as port:
-        told["alone"] = _asked(port, 5.0)
+        report["alone"] = _asked(port, 5.0)
         spawn = multiprocessing.get_context("spawn")
         ready, connected = spawn.Event(), spawn.Value("l", 0)
         slow = spawn.Process(target=_slow, args=(port, args.clients, ready, connected), daemon=True)
         slow.start()
         ready.wait()
-        told["beside_slow_clients"] = _asked(port, args.seconds)
-        told["connections_of_slow_clients"] = connected.value
+        report["beside_slow_clients"] = _asked(port, args.seconds)
+        report["connections_of_slow_clients"] = connected.value
         slow.terminate()
         slow.join()
-    print(told)
+    print(report)
     if args.json is not None:
-        write_json(args.json, told)
+        write_json(args.json, report)
 
 
 @contextlib.contextmanager

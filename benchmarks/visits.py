@@ -49,10 +49,10 @@ class VisitWalk(ChangedWalk):
 
     def world(self) -> SimulatedWorld:
         """The world of the visit."""
-        known = {t.id for t in WalkSettings(seed=self.seed).world().things}
+        known = {t.id for t in WalkSettings(seed=self.seed).world().objects}
         world = super().world()
-        added = (replace(t, id=t.id if t.id in known else 100 * self.visit + t.id) for t in world.things)
-        return replace(world, things=tuple(added))
+        added = (replace(t, id=t.id if t.id in known else 100 * self.visit + t.id) for t in world.objects)
+        return replace(world, objects=tuple(added))
 
 
 class BackWalk(VisitWalk, ReturnWalk):

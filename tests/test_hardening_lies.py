@@ -100,13 +100,13 @@ SOME = {
 
 @pytest.mark.parametrize("told", SOME)
 def test_a_lie_is_one_line_that_names_table_and_row(
-    told: str, hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
+    message: str, hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with sqlite3.connect(rich) as database:
-        assert database.execute(SOME[told]).rowcount > 0
+        assert database.execute(SOME[message]).rowcount > 0
         hostile.lies.sign(database)
     assert run(["verify", str(rich)]) == 1
-    assert told in capsys.readouterr().out
+    assert message in capsys.readouterr().out
     with pytest.raises(MemoryFileError, match="repair"), Store.open(rich) as store:
         store.instances.all()
         store.relations.all()

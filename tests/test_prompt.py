@@ -213,7 +213,7 @@ def test_the_pack_is_whole(memory: SceneMemory, tmp_path: Path) -> None:
 
 
 def test_grids_of_many_things_hold_those_that_have_a_row(memory: SceneMemory, tmp_path: Path) -> None:
-    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90, things_on_grids=1))
+    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90, objects_on_grids=1))
     maps = json.loads((tmp_path / "pack/cognitive_map.json").read_text())
     listed = json.loads((tmp_path / "pack/list3r-prompt.json").read_text())["listed"]
     things = [i.id for i in memory.instances()]

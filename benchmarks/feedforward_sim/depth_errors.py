@@ -101,7 +101,7 @@ def patches(
 
 def structure_mask(video: SimulatedVideo, frames: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Pixels of walls, floors and ceilings. Shape (F, H, W)."""
-    ids = [t.id for t in video.world.things if t.structure is not None]
+    ids = [t.id for t in video.world.objects if t.structure is not None]
     return np.isin(video.ids[frames], ids)
 
 
@@ -125,11 +125,11 @@ def _doubt(
     video: SimulatedVideo, frames: NDArray[np.int64], settings: DepthErrorSettings, rng: np.random.Generator
 ) -> Floats:
     """Factors on the confidence: things that are doubted without cause. Shape (F, H, W)."""
-    top = max(int(video.ids.max()), max((t.id for t in video.world.things), default=0))
+    top = max(int(video.ids.max()), max((t.id for t in video.world.objects), default=0))
     doubted = rng.random(top + 1) < settings.doubted_share
     median, spread = settings.doubted_factor
     factor = np.minimum(median * np.exp(spread * rng.standard_normal(top + 1)), 1.0)
-    for thing in video.world.things:
-        doubted[thing.id] &= thing.structure is None
+    for obj in video.world.objects:
+        doubted[obj.id] &= obj.structure is None
     doubted[[0, *(m.id for m in video.movers)]] = False
     return np.where(doubted, factor, 1.0).astype(np.float32)[video.ids[frames]]

@@ -70,7 +70,7 @@ class Appearance:
     """Embeddings of the things of a video, one for each id."""
 
     def __init__(self, video: SimulatedVideo, size: int, label_part: float, own_part: float) -> None:
-        labels = {t.id: t.label for t in video.world.things} | {m.id: m.label for m in video.movers}
+        labels = {t.id: t.label for t in video.world.objects} | {m.id: m.label for m in video.movers}
         words = {label: k for k, label in enumerate(sorted(set(labels.values())))}
         self.top = max([int(video.ids.max(initial=0)), *labels])
         self.looks = np.array([video.looks.get(k, 10_000 + k) for k in range(self.top + 1)])
@@ -130,7 +130,7 @@ def frame_descriptors(video: SimulatedVideo, settings: FrameDescriptorSettings, 
     looks = Appearance(video, size, 0.5, 0.0)
     areas = _areas(video, looks.top)
     structure = np.zeros(looks.top + 1, bool)
-    structure[[t.id for t in video.world.things if t.structure is not None]] = True
+    structure[[t.id for t in video.world.objects if t.structure is not None]] = True
     amount = np.sqrt(areas) * np.where(structure, settings.structure_weight, 1.0)
     amount[..., 0] = 0.0
     content, arrangement = np.zeros((count, size)), np.zeros((count, size))
@@ -194,8 +194,8 @@ def azimuths(video: SimulatedVideo, top: int) -> Array:
     for world, rows in ((video.world, slice(0, cut)), (video.later or video.world, slice(cut, None))):
         place, yaw = np.zeros((top + 1, 2)), np.zeros(top + 1)
         round_ = np.zeros(top + 1, bool)
-        for thing in world.things:
-            place[thing.id], yaw[thing.id], round_[thing.id] = thing.box().center[:2], thing.yaw, thing.is_round()
+        for obj in world.objects:
+            place[obj.id], yaw[obj.id], round_[obj.id] = obj.box().center[:2], obj.yaw, obj.is_round()
         away = video.T_world_cam[rows, None, :2, 3] - place[None]
         azimuth = np.arctan2(away[..., 1], away[..., 0]) - yaw
         parts.append(np.where(round_, 0.0, azimuth))

@@ -111,14 +111,14 @@ def simulate_library(
     colors = _in_light(_colors(video, looks.top), light)
     azimuth = azimuths(video, looks.top)[geometry.frames] if settings.embedding.side_part else None
     instances = tuple(
-        _instance(number, track, ids, geometry, _Looks(looks, colors, azimuth, light), settings, rng)
+        _instance(number, track, ids, geometry, _Appearance(looks, colors, azimuth, light), settings, rng)
         for number, track in enumerate(tracks)
     )
     return LocalLibrary(instances, _cannot_link(tracks, ids.shape), FEATURE_SPACE)
 
 
 @dataclass(frozen=True)
-class _Looks:
+class _Appearance:
     """What things look like in a chunk."""
 
     appearance: Appearance
@@ -138,7 +138,7 @@ def _make_tracks(
 ) -> list[_Track]:
     top = int(ids.max(initial=0))
     areas = np.stack([np.bincount(i.ravel(), minlength=top + 1) for i in ids])
-    structure = {t.id for t in video.world.things if t.structure is not None}
+    structure = {t.id for t in video.world.objects if t.structure is not None}
     scale = ids.shape[1] * ids.shape[2] / (64 * 48)
     tracks: list[_Track] = []
     for group in _groups(ids, areas, structure, settings, rng):
@@ -238,7 +238,7 @@ def _instance(
     track: _Track,
     ids: NDArray[np.int32],
     geometry: ChunkGeometry,
-    looks: _Looks,
+    looks: _Appearance,
     settings: InstanceErrorSettings,
     rng: np.random.Generator,
 ) -> LocalInstance:
@@ -311,8 +311,8 @@ def _support(
 def _colors(video: SimulatedVideo, top: int) -> NDArray[np.uint8]:
     """Colour of each thing: that of its first part. Shape (top + 1, 3)."""
     out = np.full((top + 1, 3), 128, np.uint8)
-    for thing in video.world.things:
-        out[thing.id] = np.clip(thing.parts[0].material.color, 0, 255)
+    for obj in video.world.objects:
+        out[obj.id] = np.clip(obj.parts[0].material.color, 0, 255)
     return out
 
 

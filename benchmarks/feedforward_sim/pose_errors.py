@@ -177,16 +177,16 @@ def _lay_on_look_alikes(
     """The upright motion that lays most of what side b sees on look-alikes that side a sees, and how much that is."""
     a, b = _weights(video, frames_a), _weights(video, frames_b)
     moving = {m.id for m in video.movers}
-    things = {t.id: t for t in video.world.things if t.structure is None and t.id not in moving}
-    one, two = [k for k in sorted(a) if k in things], [k for k in sorted(b) if k in things]
+    objects = {t.id: t for t in video.world.objects if t.structure is None and t.id not in moving}
+    one, two = [k for k in sorted(a) if k in objects], [k for k in sorted(b) if k in objects]
     best, found = 0.0, Sim3.identity()
     if not one or not two:
         return found, best
-    at_a, at_b = (np.array([things[k].box().center for k in side]) for side in (one, two))
+    at_a, at_b = (np.array([objects[k].box().center for k in side]) for side in (one, two))
     alike = np.array([[video.looks.get(i, -i) == video.looks.get(j, -j) for j in two] for i in one])
     weight = np.sqrt(np.minimum.outer([a[i] for i in one], [b[j] for j in two])) * alike
     for m, n in np.argwhere(alike):
-        turn = rotation_exp(np.array([0.0, 0.0, things[one[m]].yaw - things[two[n]].yaw]))
+        turn = rotation_exp(np.array([0.0, 0.0, objects[one[m]].yaw - objects[two[n]].yaw]))
         moved = (at_b - at_b[n]) @ turn.T + at_a[m]
         near = np.linalg.norm(at_a[:, None] - moved[None], axis=2) < settings.alike_radius_m
         score = float((weight * near).max(axis=0).sum())

@@ -18,13 +18,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from list3r.exporters.plan.layout import PlanSettings
 from machine import end_with_parent
 from PIL import Image
 
 from list3r.cli.app import run
 from list3r.exporters.components import Component
 from list3r.exporters.plan import picture
-from list3r.exporters.plan.layout import PlanSettings
 from list3r.exporters.registry import FORMATS
 from list3r.exporters.simready import thumbnail
 from list3r.memory.store import read_checks, store
@@ -84,7 +84,7 @@ class Outcome:
     seconds: float
     """Processor time."""
     out: str
-    told: str
+    message: str
     """Standard error, or the error and its place."""
     peak_mb: int = 0
 
@@ -102,22 +102,22 @@ def ask(words: Sequence[str], longest_s: float | None = None, *, serves: bool = 
     """Run one command; one that serves is interrupted as by Ctrl-C."""
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace", write_through=True) for _ in range(2))
     started = time.process_time()
-    told = ""
+    message = ""
     _forget_peak()
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _alarm(longest_s, serves):
             ended = str(run(list(words)))
     except _TooLongError as error:
-        ended, told = "hang", _place(error)
+        ended, message = "hang", _place(error)
     except SystemExit as stop:
         ended = str(stop.code)
     except BaseException as error:
-        ended, told = "traceback", f"{type(error).__name__}: {str(error)[:150]} at {_place(error)}"
+        ended, message = "traceback", f"{type(error).__name__}: {str(error)[:150]} at {_place(error)}"
     peak = peak_mb()
     if peak > MOST_MB and ended not in ("hang", "traceback"):
-        ended, told = "memory", f"{peak} MB"
+        ended, message = "memory", f"{peak} MB"
     printed, errors = (stream.detach().getvalue().decode() for stream in (out, err))  # type: ignore[attr-defined]
-    return Outcome(ended, time.process_time() - started, printed, told or errors[:300], peak)
+    return Outcome(ended, time.process_time() - started, printed, message or errors[:300], peak)
 
 
 def command_on(memory: Path, command: str, folder: Path) -> list[str]:

@@ -41,7 +41,7 @@ def run_list(path: Path | None) -> dict[str, Any]:
     if held and held["machine"] != machine():
         raise SystemExit(f"{path} was measured on another machine; name another file")
     rows: dict[str, dict[str, str]] = held.get("findings", {})
-    told: dict[str, Any] = {}
+    message: dict[str, Any] = {}
     with _worktree(BEFORE) as before:
         for when, checkout, commit in (("before", before, BEFORE), ("after", HERE, STARTED_AT)):
             fresh = held.get(when) == commit
@@ -50,11 +50,11 @@ def run_list(path: Path | None) -> dict[str, Any]:
                 rows.setdefault(key, {})[when] = found
                 if key in NOT_SHOWN and not rows[key].get("before", "not looked for"):
                     rows[key]["why"] = NOT_SHOWN[key]
-                told = {"before": BEFORE, "after": STARTED_AT, "findings": {k: rows[k] for k in keys() if k in rows}}
-                write_json(path, told)
+                message = {"before": BEFORE, "after": STARTED_AT, "findings": {k: rows[k] for k in keys() if k in rows}}
+                write_json(path, message)
                 print(f"{when:<7}{key:<60}{found or 'holds'}", flush=True)
             held[when] = commit
-    return told or held
+    return message or held
 
 
 def keys() -> list[str]:
@@ -64,18 +64,18 @@ def keys() -> list[str]:
     return sorted(ROWS, key=lambda key: int(key.split()[0]))
 
 
-def table(told: dict[str, Any]) -> str:
+def table(message: dict[str, Any]) -> str:
     """Return the list as a table in Markdown."""
-    lines = [f"| finding | before, {told['before']} | after, {told['after']} |", "|---|---|---|"]
-    for key, found in told["findings"].items():
+    lines = [f"| finding | before, {message['before']} | after, {message['after']} |", "|---|---|---|"]
+    for key, found in message["findings"].items():
         before = found.get("before") or f"holds{': ' + found['why'] if 'why' in found else ''}"
         lines.append(f"| {key} | {before} | {found.get('after') or 'holds'} |")
     return "\n".join(lines)
 
 
-def open_rows(told: dict[str, Any]) -> list[str]:
+def open_rows(message: dict[str, Any]) -> list[str]:
     """Return the findings that are not mended."""
-    return [key for key, found in told["findings"].items() if found.get("after", "not looked for")]
+    return [key for key, found in message["findings"].items() if found.get("after", "not looked for")]
 
 
 @contextlib.contextmanager

@@ -157,9 +157,9 @@ def _bag(here: Path) -> list[str]:
         struct.pack("<IIi", 1, 0, 0),
     )
     known = record({"op": b"\7", "conn": number, "topic": b"/rgb"}, words)
-    told = {"op": b"\6", "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", at), "count": struct.pack("<I", 1)}
-    told |= {"start_time": struct.pack("<II", 1, 0), "end_time": struct.pack("<II", 2, 0)}
-    chunks = record(told, number + struct.pack("<I", 1))
+    head = {"op": b"\6", "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", at), "count": struct.pack("<I", 1)}
+    head |= {"start_time": struct.pack("<II", 1, 0), "end_time": struct.pack("<II", 2, 0)}
+    chunks = record(head, number + struct.pack("<I", 1))
     counts = {"op": b"\3", "index_pos": struct.pack("<Q", at + len(body) + len(index))}
     counts |= {"conn_count": struct.pack("<I", 1), "chunk_count": struct.pack("<I", 1)}
     head = record(counts, b"")

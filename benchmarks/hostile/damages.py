@@ -58,8 +58,8 @@ def damaged(data: bytes, older: bytes, rng: random.Random) -> tuple[bytes, str]:
     """Return a damaged copy, and what was done to it."""
     kind = rng.choice(sorted(_KINDS))
     changed = bytearray(data)
-    told = _KINDS[kind](changed, older, rng)
-    return bytes(changed), f"{kind} {told}"
+    message = _KINDS[kind](changed, older, rng)
+    return bytes(changed), f"{kind} {message}"
 
 
 def _flip(data: bytearray, _: bytes, rng: random.Random) -> str:
@@ -128,8 +128,8 @@ def _page(k: int) -> slice:
 def _ask_all(sound: _Sound, what: str, tally: Tally) -> None:
     for question in QUESTIONS:
         outcome = _ask(sound.path, question)
-        told = "refused" if outcome.ended == "2" else "equal" if outcome.ended == "0" else outcome.ended
-        tally.add(what, question, outcome, name=f"question: {told}")
+        message = "refused" if outcome.ended == "2" else "equal" if outcome.ended == "0" else outcome.ended
+        tally.add(what, question, outcome, name=f"question: {message}")
         if outcome.ended == "0" and _answer(outcome, sound.path) != sound.answers[question]:
             tally.problem(what, question, f"another answer: {outcome.out[:300]}")
 
@@ -137,11 +137,11 @@ def _ask_all(sound: _Sound, what: str, tally: Tally) -> None:
 def _edit(sound: _Sound, edit: str, what: str, verdict: Outcome, tally: Tally) -> None:
     before = sound.path.read_bytes()
     outcome = _ask(sound.path, edit)
-    told = "refused" if outcome.ended == "2" else "accepted" if outcome.ended == "0" else outcome.ended
-    tally.add(what, edit, outcome, name=f"edit: {told}")
+    message = "refused" if outcome.ended == "2" else "accepted" if outcome.ended == "0" else outcome.ended
+    tally.add(what, edit, outcome, name=f"edit: {message}")
     after = _ask(sound.path, "verify")
     if verdict.ended != "0" and after.ended == "0":
-        tally.problem(what, edit, f"{told}, and the damaged file verifies as sound")
+        tally.problem(what, edit, f"{message}, and the damaged file verifies as sound")
     if verdict.ended == "0" and outcome.ended == "0":
         content = _answer(_ask(sound.path, _CONTENT), sound.path)
         if after.ended != "0" or content != sound.edited[edit]:

@@ -200,11 +200,11 @@ def _with_crc(sql: str, table: _Rows) -> str:
 
 # ------------------------------------------------------------------------------------------- other values
 
-Told = tuple[str, Any]
+Reported = tuple[str, Any]
 """An expression of SQL with one parameter, and its argument."""
 
 
-def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Told]:
+def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Reported]:
     """Return what may stand in the place of a value: by kind of lie, as far as the value can tell it."""
     kinds = {
         "type": st.sampled_from(_TYPES).map(_plain),
@@ -225,7 +225,7 @@ def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Told]:
     return st.sampled_from(sorted(kinds)).flatmap(kinds.__getitem__)
 
 
-def _plain(value: Any) -> Told:
+def _plain(value: Any) -> Reported:
     return "?", value
 
 
@@ -314,5 +314,5 @@ def _places(value: Any) -> Any:
 
 
 def _short(argument: Any) -> Any:
-    told = repr(argument)
-    return argument if len(told) <= 80 else f"{told[:60]}... ({len(told)})"
+    message = repr(argument)
+    return argument if len(message) <= 80 else f"{message[:60]}... ({len(message)})"

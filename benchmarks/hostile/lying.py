@@ -36,7 +36,7 @@ def tell(folder: Path, first_seed: int, count: int) -> Batch:
 def batch(folder: Path, first_seed: int, n: int) -> Batch:
     """Tell the lies of one batch, and count how commands ended."""
     subject, reads = _subject(folder)
-    tally, told = Tally(), 0
+    tally, message = Tally(), 0
     forms = [*_forms(READS), *([e] for e in exports()), exports(costly=True)]
 
     def meet(lie: Lie, path: Path, command: str) -> None:
@@ -53,18 +53,18 @@ def batch(folder: Path, first_seed: int, n: int) -> Batch:
     )
     @given(lies(subject))
     def tell(lie: Lie) -> None:
-        nonlocal told
+        nonlocal message
         path = subject.with_name("lie.l3r")
         write_lie(subject, path, lie)
-        told += 1
+        message += 1
         with checked_once():
-            for command in (form[told % len(form)] for form in forms):
+            for command in (form[message % len(form)] for form in forms):
                 if reads[command] & lie.tables:
                     meet(lie, path, command)
                 else:
                     tally.counts["reads nothing that lies"] += 1
-        if told % 5 == 0:
-            meet(lie, path, EDITS[told // 5 % len(EDITS)])
+        if message % 5 == 0:
+            meet(lie, path, EDITS[message // 5 % len(EDITS)])
 
     gc.disable()
     try:
@@ -72,7 +72,7 @@ def batch(folder: Path, first_seed: int, n: int) -> Batch:
     finally:
         gc.enable()
         gc.collect()
-    return tally.batch(told)
+    return tally.batch(message)
 
 
 def _forms(commands: Sequence[str]) -> list[list[str]]:

@@ -18,7 +18,7 @@ from list3r.frames.base import Camera
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.projection import SolidScene
 from list3r.simulation.rendering.render import Renderer
-from list3r.simulation.walk import look_poses
+from list3r.simulation.walk import viewing_poses
 
 Array = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
     _, poses = walk.poses()
     fps, at = walk.path.fps, round(blind.wall_at * len(poses))
     here = poses[at]
-    scene = SolidScene(walk.world().things)
+    scene = SolidScene(walk.world().objects)
     ends = _bare_wall(walk, scene, here, blind)
     before_wall = _between(*ends, round(blind.wall_s * fps))
     there, back = (_quick(a, b, fps, blind) for a, b in ((here, ends[0]), (ends[1], here)))
@@ -90,7 +90,7 @@ def _bare_wall(walk: WalkSettings, scene: SolidScene, here: Array, blind: BlindS
     """Return the first and last pose before the wall: the nearest ones that see nothing but it, by a free way."""
     world, camera = walk.world(), Camera(*(side // 8 for side in walk.size), *_small(walk.camera()))
     renderer, eye = Renderer(world, camera), here[:3, 3]
-    walls = {t.id for t in world.things if t.structure == "wall"}
+    walls = {t.id for t in world.objects if t.structure == "wall"}
     room = min(world.rooms, key=lambda r: abs((r.x0 + r.x1) / 2 - eye[0]))
     off = blind.wall_m
     sides = [((0.0, -1.0), -90.0), ((0.0, 1.0), 90.0), ((-1.0, 0.0), 180.0), ((1.0, 0.0), 0.0)]
@@ -100,7 +100,7 @@ def _bare_wall(walk: WalkSettings, scene: SolidScene, here: Array, blind: BlindS
         x = room.x0 + share * (room.x1 - room.x0) if way[0] == 0 else (room.x0 + off if way[0] < 0 else room.x1 - off)
         y = share * room.depth if way[1] == 0 else (off if way[1] < 0 else room.depth - off)
         places = [np.array([x, y, eye[2]]) + s * blind.along_m * along for s in (-0.5, 0.5)]
-        T = look_poses(np.array(places), *(np.array([a, a]) for a in (np.radians(yaw_deg), 0.0, 0.0)))
+        T = viewing_poses(np.array(places), *(np.array([a, a]) for a in (np.radians(yaw_deg), 0.0, 0.0)))
         seen = {int(i) for pose in T for i in np.unique(renderer.render(pose).ids)}
         if len(seen) == 1 and seen <= walls and all(_free(scene, eye, place) for place in places):
             found.append((float(np.linalg.norm(places[0] - eye)), len(found), T))
@@ -139,14 +139,14 @@ def _mixed(start: Array, end: Array, share: float) -> Array:
     """Return the pose at a share of the way, turned as a person turns: by yaw, pitch and roll. Shape (4, 4)."""
     a, b = _angles(start), _angles(end)
     place = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
-    return np.asarray(look_poses(place[None], *(np.array([v]) for v in a + share * _turned(b - a)))[0])
+    return np.asarray(viewing_poses(place[None], *(np.array([v]) for v in a + share * _turned(b - a)))[0])
 
 
 def _angles(T_world_cam: Array) -> Array:
-    """Yaw, pitch and roll of `look_poses`, radians. Shape (3,)."""
+    """Yaw, pitch and roll of `viewing_poses`, radians. Shape (3,)."""
     forward = T_world_cam[:3, 2]
     yaw, pitch = np.arctan2(forward[1], forward[0]), np.arcsin(np.clip(forward[2], -1.0, 1.0))
-    level = look_poses(np.zeros((1, 3)), np.array([yaw]), np.array([pitch]), np.zeros(1))[0]
+    level = viewing_poses(np.zeros((1, 3)), np.array([yaw]), np.array([pitch]), np.zeros(1))[0]
     right = T_world_cam[:3, 0]
     return np.array([yaw, pitch, np.arctan2(right @ level[:3, 1], right @ level[:3, 0])])
 

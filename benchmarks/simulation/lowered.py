@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.simulation.blind import LOWERED, TURN, WALKED, BlindWalk
 from benchmarks.simulation.presets import make_shot
 from benchmarks.simulation.walks import PresetWalk
-from list3r.simulation.walk import look_poses
+from list3r.simulation.walk import viewing_poses
 
 Array = NDArray[np.float64]
 
@@ -75,6 +75,6 @@ def _pitched(T_world_cam: Array, share: Array, pitch: float) -> Array:
     forward, right = T_world_cam[:, :3, 2], T_world_cam[:, :3, 0]
     yaw = np.arctan2(forward[:, 1], forward[:, 0])
     held = np.arcsin(np.clip(forward[:, 2], -1.0, 1.0))
-    level = look_poses(T_world_cam[:, :3, 3], yaw, held, np.zeros(len(yaw)))
+    level = viewing_poses(T_world_cam[:, :3, 3], yaw, held, np.zeros(len(yaw)))
     roll = np.arctan2((right * level[:, :3, 1]).sum(axis=1), (right * level[:, :3, 0]).sum(axis=1))
-    return look_poses(T_world_cam[:, :3, 3], yaw, held + share * (pitch - held), roll)
+    return viewing_poses(T_world_cam[:, :3, 3], yaw, held + share * (pitch - held), roll)

@@ -11,7 +11,7 @@ from benchmarks.simulation.routes import FreeMap
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import Placer
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import MovingThing, SimulatedThing
+from list3r.simulation.worlds.objects import MovingObject, SimulatedObject
 
 Array = NDArray[np.float64]
 
@@ -22,18 +22,18 @@ _HASTE_M_S = 1.3
 
 def make_movers(
     building: Building, free: FreeMap, T_world_cam: Array, fps: float, rng: np.random.Generator
-) -> tuple[MovingThing, ...]:
+) -> tuple[MovingObject, ...]:
     """A walking person and a carton that the person carries away in the middle of the video."""
-    first = max(t.id for t in building.world.things) + 1
+    first = max(t.id for t in building.world.objects) + 1
     p = Placer(rng)
     xy, yaw = _stroll(free, T_world_cam, fps, rng)
-    person = MovingThing(
-        SimulatedThing(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw)
+    person = MovingObject(
+        SimulatedObject(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw)
     )
     size = (float(rng.uniform(0.36, 0.46)), float(rng.uniform(0.28, 0.36)), float(rng.uniform(0.26, 0.36)))
     carton = f.carton(size, p.bright("stripes", 0.4), p.bright("plain", 0.3))
-    return person, MovingThing(
-        SimulatedThing(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(free, T_world_cam, xy, yaw, fps, rng)
+    return person, MovingObject(
+        SimulatedObject(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(free, T_world_cam, xy, yaw, fps, rng)
     )
 
 

@@ -166,8 +166,8 @@ def write_phone_walk(
         if stretch == DARK:
             depth, sure = np.zeros_like(depth), np.zeros_like(sure)
         out.add(Frame(k, time_s, color, depth, given[k]), sure)
-        for thing, area in zip(*np.unique(drawn.ids[drawn.ids > 0], return_counts=True), strict=True):
-            entry = seen.setdefault(int(thing), {"frames": 0, "largest_px": 0})
+        for obj, area in zip(*np.unique(drawn.ids[drawn.ids > 0], return_counts=True), strict=True):
+            entry = seen.setdefault(int(obj), {"frames": 0, "largest_px": 0})
             entry["frames"], entry["largest_px"] = entry["frames"] + 1, max(entry["largest_px"], int(area))
     out.close()
     write_tum(folder / "groundtruth.txt", Trajectory(way.time_s, way.T_world_cam))

@@ -33,7 +33,7 @@ from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
 from list3r.simulation.walk import PathSettings
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.truth import footprint_gap
 from list3r.simulation.worlds.world import SimulatedWorld
 
@@ -90,15 +90,15 @@ def _building(preset: str, seed: int, rng: np.random.Generator) -> Building:
 
 def _distinct(world: SimulatedWorld, rooms: tuple[PlacedRoom, ...], rng: np.random.Generator) -> SimulatedWorld:
     """Return the world with three things of each room in colours of their own."""
-    things = {t.id: t for t in world.things}
+    objects = {t.id: t for t in world.objects}
     for room in rooms:
-        loose = [k for k in room.things if things[k].structure is None]
+        loose = [k for k in room.objects if objects[k].structure is None]
         for k in rng.permutation(len(loose))[:3]:
-            thing = things[loose[k]]
+            obj = objects[loose[k]]
             low, high = (_rgb(rng), _rgb(rng))
-            paint = replace(thing.parts[0].material, color=low, accent=high, seed=int(rng.integers(1 << 16)))
-            things[thing.id] = replace(thing, parts=tuple(replace(p, material=paint) for p in thing.parts))
-    return replace(world, things=tuple(things[t.id] for t in world.things))
+            paint = replace(obj.parts[0].material, color=low, accent=high, seed=int(rng.integers(1 << 16)))
+            objects[obj.id] = replace(obj, parts=tuple(replace(p, material=paint) for p in obj.parts))
+    return replace(world, objects=tuple(objects[t.id] for t in world.objects))
 
 
 def _rgb(rng: np.random.Generator) -> tuple[int, int, int]:
@@ -156,42 +156,42 @@ def _near(director: Director, room: PlacedRoom, view: View) -> View:
 
 def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generator, floor: bool) -> SimulatedWorld:
     """Return the world with half of what stands on furniture, and on the `floor`, of a room put elsewhere in it."""
-    things = {t.id: t for t in world.things}
-    floors = [k for k in room.things if things[k].structure == "floor"]
-    for k in room.things:
-        thing = things[k]
-        loose = thing.structure is None and thing.attached is None and thing.container is None
-        if not loose or thing.label in _STAYS or rng.random() >= 0.5:
+    objects = {t.id: t for t in world.objects}
+    floors = [k for k in room.objects if objects[k].structure == "floor"]
+    for k in room.objects:
+        obj = objects[k]
+        loose = obj.structure is None and obj.attached is None and obj.container is None
+        if not loose or obj.label in _STAYS or rng.random() >= 0.5:
             continue
-        on_floor = thing.support is None or thing.support in floors
+        on_floor = obj.support is None or obj.support in floors
         if on_floor and not floor:
             continue
-        carried = [t for t in things.values() if k in (t.support, t.container)]
-        carried += [t for t in things.values() if t.container in {c.id for c in carried}]
-        moved = _elsewhere(thing, things, room, on_floor, rng)
+        carried = [t for t in objects.values() if k in (t.support, t.container)]
+        carried += [t for t in objects.values() if t.container in {c.id for c in carried}]
+        moved = _elsewhere(obj, objects, room, on_floor, rng)
         if moved is None:
             continue
-        for t in (*carried, thing):
-            things[t.id] = _with(t, thing, moved)
-    return replace(world, things=tuple(things[t.id] for t in world.things))
+        for t in (*carried, obj):
+            objects[t.id] = _with(t, obj, moved)
+    return replace(world, objects=tuple(objects[t.id] for t in world.objects))
 
 
 def _elsewhere(
-    thing: SimulatedThing, things: dict[int, SimulatedThing], room: PlacedRoom, floor: bool, rng: np.random.Generator
-) -> SimulatedThing | None:
+    obj: SimulatedObject, objects: dict[int, SimulatedObject], room: PlacedRoom, floor: bool, rng: np.random.Generator
+) -> SimulatedObject | None:
     """Return the thing at a free place of the room's floor or of what it stands on, None where there is none."""
-    base = None if floor or thing.support is None else things[thing.support].box()
+    base = None if floor or obj.support is None else objects[obj.support].box()
     rivals = [
         t.box()
-        for t in (things[k] for k in room.things)
-        if t.structure is None and t.id != thing.id and t.support == thing.support and t.container is None
+        for t in (objects[k] for k in room.objects)
+        if t.structure is None and t.id != obj.id and t.support == obj.support and t.container is None
     ]
     for _ in range(60):
         if base is None:
             x, y = rng.uniform((room.x0 + 0.35, room.y0 + 0.35), (room.x1 - 0.35, room.y1 - 0.35))
         else:
             x, y = (base.center + base.rotation @ (rng.uniform(-0.4, 0.4, 3) * base.size))[:2]
-        tried = replace(thing, position=(float(x), float(y), thing.position[2]), yaw=float(rng.uniform(0, 2 * np.pi)))
+        tried = replace(obj, position=(float(x), float(y), obj.position[2]), yaw=float(rng.uniform(0, 2 * np.pi)))
         corners = tried.box().corners()[:, :2]
         low, high = corners.min(axis=0), corners.max(axis=0)
         inside = bool(
@@ -202,13 +202,13 @@ def _elsewhere(
     return None
 
 
-def _with(thing: SimulatedThing, before: SimulatedThing, after: SimulatedThing) -> SimulatedThing:
+def _with(obj: SimulatedObject, before: SimulatedObject, after: SimulatedObject) -> SimulatedObject:
     """Return a thing that is carried by one that was put elsewhere."""
     turn = after.yaw - before.yaw
     c, s = float(np.cos(turn)), float(np.sin(turn))
-    dx, dy = thing.position[0] - before.position[0], thing.position[1] - before.position[1]
+    dx, dy = obj.position[0] - before.position[0], obj.position[1] - before.position[1]
     x, y = after.position[0] + c * dx - s * dy, after.position[1] + s * dx + c * dy
-    return replace(thing, position=(x, y, thing.position[2]), yaw=thing.yaw + turn)
+    return replace(obj, position=(x, y, obj.position[2]), yaw=obj.yaw + turn)
 
 
 def _cast(preset: str, seed: int, take: Take, later: SimulatedWorld | None, size: tuple[int, int]) -> SimulatedVideo:
@@ -217,11 +217,11 @@ def _cast(preset: str, seed: int, take: Take, later: SimulatedWorld | None, size
     depth = np.empty((len(poses), camera.height, camera.width), np.float32)
     ids = np.empty(depth.shape, np.int32)
     other = _other_camera(camera, seed) if preset == "seasons" else None
-    casters = Caster(world.things, camera), Caster((later or world).things, other or camera)
+    casters = Caster(world.objects, camera), Caster((later or world).objects, other or camera)
     for k, pose in enumerate(poses):
         depth[k], ids[k] = casters[int(k >= cut)].cast(pose)
     light = (np.arange(len(poses)) >= cut).astype(np.int64) if preset in _LIT else None
-    looks = appearance_classes(world.things)
+    looks = appearance_classes(world.objects)
     time_s = np.arange(len(poses)) / take.path.fps
     return SimulatedVideo(
         preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), looks, light, later, other

@@ -20,15 +20,15 @@ from benchmarks.simulation.furnisher import (
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, wall_paint
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 
 
-def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[SimulatedThing, ...]:
+def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[SimulatedObject, ...]:
     """All things of a room in its own coordinates: x from 0 to width, y from 0 to depth; ids from 1, the floor first.
 
     Colours, sizes and places are drawn from the placer's generator; its list of things must be empty.
     """
-    assert not p.things
+    assert not p.objects
     walls = _shell(p, plan)
     clear = []
     for door in plan.doors:
@@ -41,7 +41,7 @@ def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[Simulate
             p.add(HERE, "door frame", _frame(p), x, y, yaw, attached=walls[door.side])
     furnisher = Furnisher(p, plan, catalogue, clear, walls)
     KINDS[plan.kind](furnisher)
-    return tuple(p.things)
+    return tuple(p.objects)
 
 
 def _shell(p: Placer, plan: RoomPlan) -> dict[str, int]:

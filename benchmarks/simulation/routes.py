@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from benchmarks.simulation.buildings import Building, PlacedRoom
 from list3r.simulation.walk import PathSettings, walk_duration
-from list3r.simulation.worlds.things import SimulatedThing, stack_solids
+from list3r.simulation.worlds.objects import SimulatedObject, stack_solids
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
@@ -37,8 +37,8 @@ class FreeMap:
         high = np.array([max(r.x1 for r in rooms), max(r.y1 for r in rooms)]) + 0.5
         self._origin = low
         shape = tuple(np.ceil((high - low) / _CELL_M).astype(int)[::-1])
-        walls = [t for t in building.world.things if t.structure == "wall"]
-        others = [t for t in building.world.things if t.structure is None]
+        walls = [t for t in building.world.objects if t.structure == "wall"]
+        others = [t for t in building.world.objects if t.structure is None]
         floor = np.zeros(shape, np.uint8)
         for room in rooms:
             self._fill(
@@ -56,9 +56,9 @@ class FreeMap:
         hull = cv2.convexHull(((corners - self._origin) / _CELL_M - 0.5).astype(np.float32))
         cv2.fillConvexPoly(image, np.rint(hull * 16).astype(np.int32), 1, shift=4)
 
-    def _occupied(self, things: list[SimulatedThing], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def _occupied(self, objects: list[SimulatedObject], shape: tuple[int, ...]) -> NDArray[np.bool_]:
         image = np.zeros(shape, np.uint8)
-        for box in stack_solids(things).corners() if things else ():
+        for box in stack_solids(objects).corners() if objects else ():
             if box[:, 2].max() > _BODY_M[0] and box[:, 2].min() < _BODY_M[1]:
                 self._fill(image, box[::2, :2])
         return image.astype(bool)
@@ -192,9 +192,9 @@ class Director:
 
     def _targets(self, room: PlacedRoom) -> Array:
         """What there is to look at in a room: its things, and its corners. Shape (N, 3)."""
-        wanted = set(room.things)
-        things = [t.box() for t in self.building.world.things if t.id in wanted and t.structure is None]
-        points = [box.center for box in things if box.center[2] < 1.7 and box.size.max() > 0.3]
+        wanted = set(room.objects)
+        objects = [t.box() for t in self.building.world.objects if t.id in wanted and t.structure is None]
+        points = [box.center for box in objects if box.center[2] < 1.7 and box.size.max() > 0.3]
         corners = [np.array([x, y, 0.8]) for x in (room.x0, room.x1) for y in (room.y0, room.y1)]
         return np.array([np.array([p[0], p[1], 0.35 + 0.55 * p[2]]) for p in points] + corners)
 

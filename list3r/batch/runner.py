@@ -92,7 +92,7 @@ def run_batch(
     groups: Sequence[Sequence[BatchTask]],
     engine: Engine,
     settings: BatchSettings,
-    on_outcome: OnOutcome = lambda outcome, settled, total: None,
+    on_outcome: OnOutcome = lambda outcome, finished, total: None,
 ) -> BatchReport:
     """Do the tasks that are not done yet; tasks of one memory one after the other, others side by side.
 
@@ -111,9 +111,9 @@ def run_here(group: Sequence[BatchTask], settings: BatchSettings, on_outcome: On
     """Do the tasks of one memory in this process, without a manifest: what an element of an array job does."""
     Output(settings.out).prepare()
     outcomes = []
-    for settled, job in enumerate(settings.jobs([group])[0], 1):
+    for finished, job in enumerate(settings.jobs([group])[0], 1):
         outcomes.append(run_task(job))
-        on_outcome(outcomes[-1], settled, len(group))
+        on_outcome(outcomes[-1], finished, len(group))
     done = [o for o in outcomes if o.state == "done"]
     return BatchReport(len(done), sum(o.built for o in done), len(outcomes) - len(done), [_row(o) for o in outcomes])
 
@@ -133,7 +133,7 @@ class _Run:
         self._waiting: deque[deque[BatchJob]] = deque()
         self._under_way: dict[str, deque[BatchJob]] = {}
         self._lost: dict[str, int] = {}
-        self._settled = self._built = self._total = 0
+        self._finished = self._built = self._total = 0
 
     def run(self, groups: Sequence[Sequence[BatchTask]]) -> BatchReport:
         tasks = [t for group in groups for t in group]
@@ -142,7 +142,7 @@ class _Run:
         there = {m: output.size(m) is not None for m in {t.memory for t in tasks if rows[t].state == "done"}}
         for jobs in self._settings.jobs(groups):
             left = deque(j for j in jobs if rows[j.task].state != "done" or not there[j.task.memory])
-            self._settled += len(jobs) - len(left)
+            self._finished += len(jobs) - len(left)
             if left:
                 self._waiting.append(left)
         self._total = len(tasks)
@@ -173,8 +173,8 @@ class _Run:
         self._ledger.ended(outcome, "pending" if again else "done" if outcome.state == "done" else "failed")
         if not again:
             jobs.popleft()
-            self._settled += 1
+            self._finished += 1
             self._built += outcome.built
-        self._on_outcome(outcome, self._settled, self._total)
+        self._on_outcome(outcome, self._finished, self._total)
         if jobs:
             self._waiting.appendleft(jobs)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.catalog.records import CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
+from list3r.catalog.records import CatalogFilters, CatalogInstance, MemoryContent, MemoryEntry, Wanted
 
 MOST_RANKED = 2_000
 """Most instances that match some words and are ranked; of more, any of them."""
@@ -37,13 +37,13 @@ class Backend(Protocol):
         """Return entries by name, all or those of some names."""
         ...
 
-    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+    def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
         """Return one instance."""
         ...
 
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and its k instances whose axis-aligned boxes are nearest to a point, the nearest first.
 
         None where there is no memory of that name.
@@ -52,13 +52,13 @@ class Backend(Protocol):
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and its instances whose axis-aligned boxes meet a box; None where there is no such memory."""
         ...
 
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+    ) -> tuple[list[tuple[CatalogInstance, float]], int]:
         """Return the k that are wanted with how well the words name them, the best first, and how many were ranked."""
         ...
 
@@ -82,7 +82,7 @@ class Backend(Protocol):
 
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
-    ) -> list[tuple[CatalogThing, float]]:
+    ) -> list[tuple[CatalogInstance, float]]:
         """Return the k whose vectors are most like one of length 1, with the cosine, the most alike first."""
         ...
 

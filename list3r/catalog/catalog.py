@@ -20,9 +20,9 @@ from list3r.catalog.records import (
     CatalogAnswers,
     CatalogError,
     CatalogFilters,
+    CatalogInstance,
     CatalogMatch,
     CatalogRelation,
-    CatalogThing,
     MemoryEntry,
     UnknownMemoryError,
     Wanted,
@@ -271,13 +271,13 @@ class Catalog:
     def _entries(self, memory: str | None) -> list[MemoryEntry]:
         return [] if memory is None else [self.memory(memory)]
 
-    def _known(self, memory: str, instance_id: int | None) -> CatalogThing:
+    def _known(self, memory: str, instance_id: int | None) -> CatalogInstance:
         assert instance_id is not None
         found, name = None, printable(memory)
         if 0 <= instance_id <= _LARGEST_ID:
-            found = self._backend.thing(name, instance_id)
+            found = self._backend.instance(name, instance_id)
             if found is None:  # there is no such memory, or it was taken in again since it was last asked for
-                found = self._backend.thing(self.memory(name).name, instance_id)
+                found = self._backend.instance(self.memory(name).name, instance_id)
         if found is None:
             raise UnknownIdError(f"the catalogue has no instance {instance_id} in {memory}")
         return found
@@ -323,7 +323,7 @@ class Catalog:
 
     def _answers(
         self,
-        rows: Iterable[tuple[CatalogThing, float, float | None, str]],
+        rows: Iterable[tuple[CatalogInstance, float, float | None, str]],
         known: Sequence[MemoryEntry],
         notes: Sequence[str] = (),
     ) -> CatalogAnswers:
@@ -335,7 +335,9 @@ class Catalog:
         return CatalogAnswers(found, [*notes, *notices])
 
 
-def _of(name: str, found: tuple[MemoryEntry, list[CatalogThing]] | None) -> tuple[MemoryEntry, list[CatalogThing]]:
+def _of(
+    name: str, found: tuple[MemoryEntry, list[CatalogInstance]] | None
+) -> tuple[MemoryEntry, list[CatalogInstance]]:
     """Return what a database found in a memory. Raises `UnknownMemoryError` where there is none of that name."""
     if found is None:
         raise _unknown(name)
@@ -357,21 +359,23 @@ def is_stale(entry: MemoryEntry) -> bool | None:
     return (now.st_size, now.st_mtime_ns) != (entry.bytes, entry.mtime_ns)
 
 
-def box_distances(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_distances(instances: Sequence[CatalogInstance], point: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distances of a point from oriented boxes, 0 inside, world units. Shape (N,)."""
-    apart = point - np.array([t.box.center for t in things]).reshape(-1, 3)
-    axes, size = (np.array([getattr(t.box, name) for t in things]) for name in ("rotation", "size"))
+    apart = point - np.array([t.box.center for t in instances]).reshape(-1, 3)
+    axes, size = (np.array([getattr(t.box, name) for t in instances]) for name in ("rotation", "size"))
     local = np.einsum("ni,nij->nj", apart, axes.reshape(-1, 3, 3))
     return np.asarray(np.linalg.norm(np.maximum(np.abs(local) - size.reshape(-1, 3) / 2.0, 0.0), axis=1))
 
 
-def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> list[tuple[float, int, CatalogThing]]:
+def _by_distance(
+    instances: Sequence[CatalogInstance], point: NDArray[np.float64]
+) -> list[tuple[float, int, CatalogInstance]]:
     """Return things with the distance of a point from their boxes and their number, the nearest first."""
-    held = zip(box_distances(things, point).tolist(), things, strict=True)
+    held = zip(box_distances(instances, point).tolist(), instances, strict=True)
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
 
 
-def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, found: Sequence[Any]) -> CatalogMatch:
+def _match(t: CatalogInstance, entry: MemoryEntry, stale: bool | None, found: Sequence[Any]) -> CatalogMatch:
     score, distance, reason = found
     return CatalogMatch(
         t.memory,

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from list3r.batch.storage import checked_name, fetched, is_remote
-from list3r.catalog.records import CatalogError, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
+from list3r.catalog.records import CatalogError, CatalogInstance, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
@@ -40,7 +40,7 @@ def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryC
         )
     name = _own_name(path) if name is None else checked_name(name)
     with Store.open(local) as store, store.snapshot():
-        things = [_thing(name, i) for i in store.instances.all()]
+        instances = [_instance(name, i) for i in store.instances.all()]
         relations = [
             (r.subject, r.predicate, r.object, float(r.confidence), float(r.margin)) for r in store.relations.all()
         ]
@@ -54,10 +54,10 @@ def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryC
             mtime_ns,
             store.facts.scale_kind or "relative",
             store.facts.gravity,
-            sum(t.structure is None for t in things),
+            sum(t.structure is None for t in instances),
             len(store.sessions.all()),
         )
-    return MemoryContent(entry, things, relations, spaces)
+    return MemoryContent(entry, instances, relations, spaces)
 
 
 def _own_name(path: str) -> str:
@@ -67,9 +67,9 @@ def _own_name(path: str) -> str:
         raise OptionError(f"{path}: {error}; rename the file, or add it under another name") from None
 
 
-def _thing(memory: str, i: Instance) -> CatalogThing:
+def _instance(memory: str, i: Instance) -> CatalogInstance:
     known = vocabulary(i.label, i.structure, i.description, i.color_name)
-    return CatalogThing(
+    return CatalogInstance(
         memory,
         i.id,
         None if i.label is None else printable(i.label),

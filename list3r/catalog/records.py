@@ -49,7 +49,7 @@ class MemoryEntry:
 
 
 @dataclass(frozen=True)
-class CatalogThing:
+class CatalogInstance:
     """What the catalogue keeps of an instance."""
 
     memory: str
@@ -97,7 +97,7 @@ class MemoryContent:
     """All that the catalogue takes from a memory file."""
 
     entry: MemoryEntry
-    things: list[CatalogThing]
+    instances: list[CatalogInstance]
     relations: list[tuple[int, str, int, float, float]]
     """Subject, predicate, object, confidence, margin."""
     spaces: list[SpaceVectors]

@@ -43,7 +43,7 @@ def imported_as(store: Store, instance_id: int) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True)
-class ImportedThing:
+class ImportedObject:
     """One thing of the map."""
 
     name: str
@@ -62,7 +62,7 @@ class ImportedMap:
     """All that was read."""
 
     format: str
-    things: tuple[ImportedThing, ...]
+    objects: tuple[ImportedObject, ...]
     metric: bool = True
     notes: tuple[str, ...] = ()
     """What the file does not say or what was left out, one sentence each."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.decoding.decode import read_raw_depth
-from list3r.importers.base import ImportedMap, ImportedThing
+from list3r.importers.base import ImportedMap, ImportedObject
 from list3r.memory.errors import FrameError, SourceError, first_line
 
 _LEAST_POINTS = 10
@@ -42,16 +42,16 @@ def read(path: Path) -> ImportedMap:
             continue
         _vote(image, mask, votes)
     owners = {point: c.most_common(1)[0][0] for point, c in votes.items()}
-    things = []
+    objects = []
     for number in sorted({n for n in owners.values() if n > 0}):
         mine = [found.points3D[k] for k, n in sorted(owners.items()) if n == number]
         if len(mine) >= _LEAST_POINTS:
             points = np.array([p.xyz for p in mine], np.float32)
-            things.append(ImportedThing(str(number), None, points, np.array([p.color for p in mine], np.uint8)))
+            objects.append(ImportedObject(str(number), None, points, np.array([p.color for p in mine], np.uint8)))
     notes = ["the model has a unit of its own: list3r scale makes it metres"]
     if unmasked:
         notes.append(f"{unmasked} of {len(found.images)} pictures have no mask")
-    return ImportedMap("colmap", tuple(things), metric=False, notes=tuple(notes))
+    return ImportedMap("colmap", tuple(objects), metric=False, notes=tuple(notes))
 
 
 def _model(path: Path) -> Path | None:

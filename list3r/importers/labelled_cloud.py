@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.importers.base import ImportedMap, ImportedThing
+from list3r.importers.base import ImportedMap, ImportedObject
 from list3r.importers.ply import points_of, read_vertices
 from list3r.memory.errors import SourceError
 
@@ -34,8 +34,8 @@ def read(path: Path) -> ImportedMap:
         )
     numbers = rows[key].astype(np.int64)
     good = np.isfinite(points).all(axis=1)
-    things = []
+    objects = []
     for number in np.unique(numbers[good & (numbers > 0)]).tolist():
         mine = good & (numbers == number)
-        things.append(ImportedThing(str(number), None, points[mine], None if rgb is None else rgb[mine]))
-    return ImportedMap("ply", tuple(things))
+        objects.append(ImportedObject(str(number), None, points[mine], None if rgb is None else rgb[mine]))
+    return ImportedMap("ply", tuple(objects))

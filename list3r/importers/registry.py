@@ -27,7 +27,7 @@ def read_map(path: Path, name: str = "auto") -> ImportedMap:
     for kind, (matches, read) in FORMATS.items():
         if name == kind or (name == "auto" and matches(path)):
             found = read(path)
-            if not found.things:
+            if not found.objects:
                 raise SourceError(f"{path} holds no things ({'; '.join(found.notes) or kind})")
             return found
     raise SourceError(f"{path} is not a map of {', '.join(FORMATS)}; predictions of networks go through `precomputed`")

@@ -14,14 +14,14 @@ _SHARE = 0.7
 """Of a thing's footprint that lies on what it stands on."""
 _LEAST, _TIMES = 4, 2.0
 """Another axis is up where this many things stand along it, and this many times more than along the stated one."""
-_MOST_THINGS = 1500
+_MOST_OBJECTS = 1500
 
 
-def up_axis_notes(things: Sequence[NDArray[np.float32]], up: str) -> tuple[str, ...]:
+def up_axis_notes(objects: Sequence[NDArray[np.float32]], up: str) -> tuple[str, ...]:
     """Return what to say where things, by their points (N, 3) each, plainly stand along another axis than `up`."""
-    if len(things) > _MOST_THINGS:
+    if len(objects) > _MOST_OBJECTS:
         return ()
-    finite = [points[np.isfinite(points).all(axis=1)] for points in things]
+    finite = [points[np.isfinite(points).all(axis=1)] for points in objects]
     boxes = np.array([[p.min(axis=0), p.max(axis=0)] for p in finite if len(p)]).reshape(-1, 2, 3)
     standing = {axis: _standing(boxes, axis) for axis in _AXES}
     best = max(standing, key=lambda axis: standing[axis])

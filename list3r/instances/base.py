@@ -39,7 +39,7 @@ class Proposals:
     """Calibrated probability that each candidate is one thing and all of it, where the discoverer knows. Shape (N,)."""
     named: tuple[tuple[tuple[str, float], ...], ...] | None = None
     """Names that each candidate may have, with their probabilities over all anchors, where it knows. N of them."""
-    scraps: Proposals | None = None
+    low_confidence: Proposals | None = None
     """What is too seldom one thing to be a candidate, with `identity` and `whole`, where the discoverer tells."""
 
 

@@ -64,7 +64,7 @@ def make_discoverer(
     return WithAppearance(found, _appearance(features, where[f"features/{features}"], device))
 
 
-def make_frame_look(features: str, folders: tuple[tuple[str, str], ...], device: str) -> FrameLook | None:
+def make_frame_descriptor(features: str, folders: tuple[tuple[str, str], ...], device: str) -> FrameLook | None:
     """What describes whole frames by the network of that name, the one that describes things; None where it is none.
 
     Raises `OptionError`.

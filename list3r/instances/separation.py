@@ -37,7 +37,7 @@ def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: flo
         (a, b)
         for a in range(len(instances))
         for b in range(a + 1, len(instances))
-        if len(well[a] & well[b]) >= frames and _two_things(parts[a], parts[b], unit)
+        if len(well[a] & well[b]) >= frames and _two_objects(parts[a], parts[b], unit)
     ]
     return np.array(pairs, np.int32).reshape(-1, 2)
 
@@ -72,7 +72,7 @@ def _well_visible(instance: LocalInstance) -> set[int]:
     return set(instance.track.frames[rows].tolist())
 
 
-def _two_things(one: _Part, two: _Part, unit: float) -> bool:
+def _two_objects(one: _Part, two: _Part, unit: float) -> bool:
     a, b = one.instance, two.instance
     if a.plane is not None and b.plane is not None and (_on_plane(a, b, unit) or _on_plane(b, a, unit)):
         return _color_difference(a, b) > COLOR_DIFFERENCE

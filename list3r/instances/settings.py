@@ -146,7 +146,7 @@ class MoverInstanceSettings:
 
 
 @dataclass(frozen=True)
-class ScrapSettings:
+class LowConfidenceSettings:
     """What is kept of things that are not listed."""
 
     least_anchors: int = 2
@@ -168,7 +168,7 @@ class InstanceSettings:
     segment: SegmentSettings = field(default_factory=SegmentSettings)
     track: MaskTrackSettings = field(default_factory=MaskTrackSettings)
     movers: MoverInstanceSettings = field(default_factory=MoverInstanceSettings)
-    scraps: ScrapSettings = field(default_factory=ScrapSettings)
+    low_confidence: LowConfidenceSettings = field(default_factory=LowConfidenceSettings)
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     """Of networks that look for things."""

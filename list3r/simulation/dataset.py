@@ -22,7 +22,7 @@ from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.rendering.shading import Lighting
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.worlds.things import MovingThing
+from list3r.simulation.worlds.objects import MovingObject
 from list3r.simulation.worlds.truth import world_truth
 from list3r.simulation.worlds.world import SimulatedWorld, make_world
 
@@ -79,7 +79,7 @@ class WalkSettings:
             raise OptionError(f"start {self.start} leaves nothing of a walk of {len(time_s)} frames")
         return time_s[self.start :], poses[self.start :]
 
-    def movers(self) -> tuple[MovingThing, ...]:
+    def movers(self) -> tuple[MovingObject, ...]:
         """Return what moves while it is filmed, with its pose in each of the frames to be written."""
         return ()
 
@@ -135,8 +135,8 @@ class _Writer:
         self._settings, self._root = settings, root
         self._time_s, self._poses = settings.poses()
         self._movers = settings.movers()
-        things = [m.thing for m in self._movers]
-        self._renderer = Renderer(settings.world(), settings.camera(), things, settings.lighting)
+        objects = [m.obj for m in self._movers]
+        self._renderer = Renderer(settings.world(), settings.camera(), objects, settings.lighting)
         self._seed = settings.seed if settings.walk_seed is None else settings.walk_seed
 
     def write_span(self, span: tuple[int, int]) -> list[dict[int, int]]:
@@ -145,7 +145,7 @@ class _Writer:
 
     def _write(self, position: int) -> dict[int, int]:
         for mover in self._movers:
-            self._renderer.scene.place(mover.thing.id, mover.T_world_object[position])
+            self._renderer.scene.place(mover.obj.id, mover.T_world_object[position])
         frame = self._renderer.render(self._poses[position])
         sensed = sense(
             frame, self._settings.sensor, self._seed, position + self._settings.start, float(self._time_s[position])
@@ -183,8 +183,8 @@ def _save(path: Path, image: NDArray[Any], options: list[int]) -> None:
 
 def _count(seen: dict[int, dict[str, int]], areas: Iterable[dict[int, int]]) -> None:
     for frame in areas:
-        for thing, area in frame.items():
-            entry = seen.setdefault(thing, {"frames": 0, "largest_px": 0})
+        for obj, area in frame.items():
+            entry = seen.setdefault(obj, {"frames": 0, "largest_px": 0})
             entry["frames"] += 1
             entry["largest_px"] = max(entry["largest_px"], area)
 

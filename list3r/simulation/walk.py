@@ -57,10 +57,10 @@ def camera_path(
     position = position + settings.sway_m * _sway(rng, time_s, 3)
     tilt = np.deg2rad(settings.sway_deg) * _sway(rng, time_s, 3)
     heading = np.interp(moment, clock, yaw) + tilt[:, 0]
-    return time_s, look_poses(position, heading, np.interp(moment, clock, pitch) + tilt[:, 1], tilt[:, 2])
+    return time_s, viewing_poses(position, heading, np.interp(moment, clock, pitch) + tilt[:, 1], tilt[:, 2])
 
 
-def look_poses(position: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
+def viewing_poses(position: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
     """T_world_cam of cameras at `position` (F, 3) that look along yaw (from +x), pitch (up) and roll, radians."""
     forward = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
     right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=1)

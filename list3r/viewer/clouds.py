@@ -62,8 +62,8 @@ class Shown:
 
     def allowed(self) -> NDArray[np.int64]:
         """Return how many points of each instance may be drawn. Shape (K,)."""
-        things, ids = self.world.instances, self.world.cloud.ids.tolist()
-        solid = np.array([self.points and (self.structure or things[n].structure is None) for n in ids], bool)
+        objects, ids = self.world.instances, self.world.cloud.ids.tolist()
+        solid = np.array([self.points and (self.structure or objects[n].structure is None) for n in ids], bool)
         return np.where(solid, self.world.cloud.counts, 0)
 
 
@@ -144,14 +144,14 @@ class PageClouds:
         if not self.slow or self._shown is None or self.seconds_a_point is None:
             return
         world, budget = self._shown.world, self._settings.moving_s / self.seconds_a_point
-        things = [i for i in world.instances.values() if self._shown.structure or i.structure is None]
-        things = sorted(things, key=lambda i: -i.observations)[: int(budget / 2 / _BOX)] if self._shown.boxes else []
-        if things:
-            ink = [color_of(world, i.id, self._shown.mode) for i in things]
+        objects = [i for i in world.instances.values() if self._shown.structure or i.structure is None]
+        objects = sorted(objects, key=lambda i: -i.observations)[: int(budget / 2 / _BOX)] if self._shown.boxes else []
+        if objects:
+            ink = [color_of(world, i.id, self._shown.mode) for i in objects]
             self._nodes["/coarse/boxes"] = box_lines(
-                self._client.scene, "/coarse/boxes", [i.box for i in things], ink, thick=0
+                self._client.scene, "/coarse/boxes", [i.box for i in objects], ink, thick=0
             )
-        left = int(budget - _BOX * len(things))
+        left = int(budget - _BOX * len(objects))
         self._cloud("/coarse/points", self._part(overview(self._shown.allowed(), left)), "square", _COARSE_M)
 
     def _draw_detail(self) -> None:
@@ -164,8 +164,8 @@ class PageClouds:
         if self._detail_at is not None and np.linalg.norm(place - self._detail_at) <= _MOVED_SHARE * reach:
             return
         self._detail_at, world = place, self._shown.world
-        things = np.array([world.instances[n].structure is None for n in world.cloud.ids.tolist()], bool)
-        hidden = np.where(things, world.cloud.counts - low, 0)
+        objects = np.array([world.instances[n].structure is None for n in world.cloud.ids.tolist()], bool)
+        hidden = np.where(objects, world.cloud.counts - low, 0)
         most = min(self._settings.detail_points, self.most_points - low.sum())
         self._clear("/fine/detail")
         if hidden.any() and most > 0:

@@ -62,12 +62,12 @@ class Layers:
     def boxes(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
         """Draw the oriented boxes; only that of the selected instance unless all are visible."""
         self.clear("boxes")
-        things = [
+        objects = [
             i for i in world.instances.values() if i.id == selected or (visible and (structure or i.structure is None))
         ]
-        if things:
-            ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in things]
-            node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in things], ink)
+        if objects:
+            ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in objects]
+            node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in objects], ink)
             self._nodes["boxes"] = [node]
 
     def path(self, path: CameraPath, session: int | None, *, visible: bool, unit: float) -> None:

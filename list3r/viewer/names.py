@@ -76,8 +76,8 @@ class PageNames:
         return node, place, (scale * _LETTER_PX * len(text), scale * _LINE_PX)
 
     def _chosen(self, world: ShownWorld, selected: int | None, *, visible: bool) -> Sequence[Instance]:
-        things = [i for i in world.instances.values() if i.structure is None and i.id != selected]
-        seen_most = sorted(things, key=lambda i: -i.observations)[: self._settings.most] if visible else []
+        objects = [i for i in world.instances.values() if i.structure is None and i.id != selected]
+        seen_most = sorted(objects, key=lambda i: -i.observations)[: self._settings.most] if visible else []
         chosen = world.instances.get(selected) if selected is not None else None
         return seen_most if chosen is None else [chosen, *seen_most]
 

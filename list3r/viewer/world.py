@@ -16,7 +16,7 @@ CHANGE_COLORS = {"added": (40, 160, 80), "moved": (235, 140, 30), "removed": (21
 COLOR_MODES = ("own colour", "instance", "changes")
 _UNCHANGED = (190, 190, 195)
 _SELECTED = (255, 200, 0)
-_BESIDE = 0.008
+_RAY_RADIUS = 0.008
 """A ray meets points no further beside it than this share of their depth: about the size at which they are drawn."""
 
 
@@ -195,14 +195,14 @@ def pick(
     step = shown.points - origin
     depth = step @ direction
     aside = np.sqrt(np.maximum((step**2).sum(axis=1) - depth**2, 0.0))
-    near = np.flatnonzero((depth > 0) & (aside < _BESIDE * depth))
+    near = np.flatnonzero((depth > 0) & (aside < _RAY_RADIUS * depth))
     first = int(near[np.argmin(depth[near])]) if len(near) else -1
     owner = int(shown.ids[np.searchsorted(np.cumsum(shown.counts), first, side="right")]) if first >= 0 else -1
     if first >= 0 and world.instances[owner].structure is None:
         return owner, shown.points[first].astype(np.float64)
     reach = float(depth[first]) if first >= 0 else np.inf
-    things = [i for i in world.instances.values() if i.structure is None or first < 0]
-    hits = [(t, i.id) for i in things if (t := _box_hit(i, origin, direction)) is not None and t < reach]
+    objects = [i for i in world.instances.values() if i.structure is None or first < 0]
+    hits = [(t, i.id) for i in objects if (t := _box_hit(i, origin, direction)) is not None and t < reach]
     if hits:
         t, n = min(hits)
         return n, origin + t * direction

@@ -40,11 +40,11 @@ def _wrong(place: Place, question: str, damage: str) -> str:
         with opened(memory) as scene:
             for n in range(1, 6):
                 try:
-                    told = repr(ask(scene))
+                    message = repr(ask(scene))
                 except Exception as error:
                     found = found or ("" if "repair" in str(error) else f"{type(error).__name__}: {error}"[:100])
                     continue
-                if told != sound:
+                if message != sound:
                     found = found or f"call {n} answers with the damaged value"
     except Exception as error:
         found = found or ("" if "repair" in str(error) else f"{type(error).__name__}: {error}"[:100])

@@ -113,7 +113,7 @@ def update_of_a_damaged_memory(place: Place) -> str:
     memory, walk = place.folder / "b.l3r", place.walk(frames=12, size=(160, 120))
     words = ("--poses", "given", "--workers", 1)
     built = place.ask("build", walk, "-m", memory, *words, longest_s=120)
-    assert built.status == 0, built.told
+    assert built.status == 0, built.message
     place.ask("label", memory, 1, "thing")
     spoil(memory, "UPDATE merges SET reason = 'so'")
     later = place.walk("later", frames=10, size=(160, 120))
@@ -151,7 +151,7 @@ def log_left_is_not_told(place: Place) -> str:
     memory = _left_in_the_log(place)
     if not Path(f"{memory}-wal").exists():
         return ""
-    silent = [c for c in ("verify", "info") if "-wal" not in place.ask(c, memory).told]
+    silent = [c for c in ("verify", "info") if "-wal" not in place.ask(c, memory).message]
     place.ask("repair", memory)
     more = "" if not Path(f"{memory}-wal").exists() else "`repair` does not fold it in"
     return first(f"{' and '.join(silent)} do not tell of it" if silent else "", more)
@@ -162,9 +162,9 @@ def copy_without_log_is_sound(place: Place) -> str:
     if not Path(f"{memory}-wal").exists():
         return ""
     copy = Path(shutil.copy(memory, place.folder / "copy.l3r"))
-    told = place.ask("verify", copy)
-    lost = "mine" not in place.ask("list", copy).told
-    return "the copy lacks the edit, and `verify` says nothing of it" if lost and "missing" not in told.told else ""
+    said = place.ask("verify", copy)
+    lost = "mine" not in place.ask("list", copy).message
+    return "the copy lacks the edit, and `verify` says nothing of it" if lost and "missing" not in said.message else ""
 
 
 def repair_of_a_newer_memory(place: Place) -> str:

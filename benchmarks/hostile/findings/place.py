@@ -45,7 +45,7 @@ class Ended:
     peak_mb: int
 
     @property
-    def told(self) -> str:
+    def message(self) -> str:
         """Return all that it said."""
         return self.out + self.err
 
@@ -159,12 +159,12 @@ class Place:
             start_new_session=True,
         )
         try:
-            told = process.communicate(timeout=longest_s)
+            message = process.communicate(timeout=longest_s)
             status: int | None = process.returncode
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
-            told, status = process.communicate(), None
-        out, err = (text.decode("utf-8", "backslashreplace") for text in told)
+            message, status = process.communicate(), None
+        out, err = (text.decode("utf-8", "backslashreplace") for text in message)
         return Ended(status, out, err, time.monotonic() - started, 0.0, 0)
 
 

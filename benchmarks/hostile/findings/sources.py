@@ -49,7 +49,7 @@ def _seven_scenes(place: Place, depth: int = 1500, frames: int = 4) -> Path:
 def _noted(place: Place, root: Path, word: str, *more: object) -> str:
     """Whether `inspect` has a word about it, or refuses it."""
     ended = place.ask("inspect", root, *more)
-    said = word in " ".join(ended.told.split())
+    said = word in " ".join(ended.message.split())
     return first(ended.bad, "" if said or ended.status == 2 else "accepted without a note")
 
 
@@ -80,8 +80,8 @@ def _scale_against_motion(times: float) -> Callable[[Place], str]:
 
     def look(place: Place) -> str:
         root = _posed_wall(place)
-        if "depth-scale" in (quiet := place.ask("inspect", root)).told and "times" in quiet.told:
-            return f"noted where the scale is right: {quiet.told[-200:]}"
+        if "depth-scale" in (quiet := place.ask("inspect", root)).message and "times" in quiet.message:
+            return f"noted where the scale is right: {quiet.message[-200:]}"
         return _noted(place, root, "motion", "--depth-scale", 1000 * times)
 
     return look
@@ -218,7 +218,7 @@ def repair_of_a_hole(place: Place) -> str:
     ended = place.ask("repair", memory, longest_s=60, limit={resource.RLIMIT_FSIZE: 300 * 2**20})
     left = [p for p in memory.parent.iterdir() if (p != memory and ".repair" in p.name) or "-repair-" in p.name]
     size = sum(p.stat().st_blocks * 512 for p in left) // 2**20
-    written = "writes until there is no more room" if "File too large" in ended.told else ""
+    written = "writes until there is no more room" if "File too large" in ended.message else ""
     return first(f"leaves {left[0].name[:24]} of {size} MB" if left else written, ended.beyond(10, 1000))
 
 

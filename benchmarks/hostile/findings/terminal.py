@@ -30,7 +30,7 @@ def stopped_reader(place: Place) -> str:
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-    wrong = "another process that writes" in ended.told or "being written by another" in ended.told
+    wrong = "another process that writes" in ended.message or "being written by another" in ended.message
     slow = f"blocked for {ended.wall_s:.0f} s" if ended.wall_s > 20 else ""
     return first(ended.bad, slow + (", called a writer" if wrong else "") if slow or wrong else "")
 
@@ -55,7 +55,7 @@ def _evil(place: Place, name: str = "m.l3r") -> Path:
 
 
 def _raw(ended: Ended) -> str:
-    for line in ended.told.split("\n"):
+    for line in ended.message.split("\n"):
         if not line.isprintable():
             at = next(c for c in line if not c.isprintable())
             return f"{at!r} is printed raw"

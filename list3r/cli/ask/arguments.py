@@ -29,7 +29,7 @@ from list3r.cli.common import parse_point
 if TYPE_CHECKING:
     from list3r.queries.match import FilterOptions
 
-OF_LOOKS = ("label", "color", "min_size", "max_size", "min_confidence", "structure")
+OF_APPEARANCE = ("label", "color", "min_size", "max_size", "min_confidence", "structure")
 """The filters of questions that do not ask for a state or a component."""
 
 

@@ -9,7 +9,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask.arguments import (
-    OF_LOOKS,
+    OF_APPEARANCE,
     CameraArguments,
     FilterArguments,
     NearArguments,
@@ -54,7 +54,7 @@ def within(
     camera: Annotated[CameraArguments, only("view", "pose", "session", "max_depth")],
     *,
     occlusion: Annotated[bool, typer.Option(help="Leave out what other things hide from the camera.")] = True,
-    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
+    filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
 ) -> None:
     """The things inside a box or a sphere, or those that a camera sees.
@@ -84,7 +84,7 @@ def similar(
     like: SimilarArguments,
     *,
     k: Count = 5,
-    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
+    filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
 ) -> None:
     """The things that look most like one instance, or like a picture.

@@ -139,12 +139,12 @@ def _read(videos: str, given: src.SourceArguments, request: BuildRequest, run: R
 def _outcome_printer(quiet: bool) -> Any:
     """Return what prints how each task ended, one line on standard error."""
 
-    def print_outcome(outcome: Outcome, settled: int, total: int) -> None:
+    def print_outcome(outcome: Outcome, finished: int, total: int) -> None:
         o = outcome
         result = f"{o.frames} frames, {o.instances} things" if o.built else o.reason
-        note(f"[{settled}/{total}] {o.task.memory}: {o.state}, {result} ({o.seconds:.1f} s)")
+        note(f"[{finished}/{total}] {o.task.memory}: {o.state}, {result} ({o.seconds:.1f} s)")
 
-    return (lambda outcome, settled, total: None) if quiet else print_outcome
+    return (lambda outcome, finished, total: None) if quiet else print_outcome
 
 
 def _print_report(report: BatchReport, json: bool) -> None:

@@ -114,6 +114,6 @@ def import_map(
     if json:
         print_answer([{"memory": str(memory), **report.as_dict()}])
         return
-    say(f"{memory}  {report.format}: {report.things} things became {report.instances} instances")
+    say(f"{memory}  {report.format}: {report.objects} things became {report.instances} instances")
     say(f"structure  {report.structure} pieces, {report.relations} relations")
     say(*(f"note: {line}" for line in report.notes))

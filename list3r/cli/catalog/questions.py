@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ALL = "@all"
 """In the place of the memory: all memories of the catalogue."""
-_TOLD = {
+_LISTED = {
     "nearest": ("words", "point", "id", "k", "min_confidence", "state", "structure"),
     "within": ("box", "point", "radius", "min_confidence", "structure"),
     "find": ("text", "k"),
@@ -76,7 +76,7 @@ def _check(name: str, arguments: Arguments, signature: inspect.Signature) -> Non
     if asked_at() is not None:
         raise _option_error("--at is not available for a catalogue; leave it out, or ask the memory file")
     for word, value in arguments.items():
-        if word not in _TOLD[name] and value != signature.parameters[word].default:
+        if word not in _LISTED[name] and value != signature.parameters[word].default:
             flag = word.replace("_", "-")
             raise _option_error(f"--{flag} is not available for a catalogue; leave it out, or ask the memory file")
 
@@ -90,7 +90,7 @@ def _ask(url: str, name: str, memory: str | None, arguments: Arguments, json: bo
     )
     with Catalog.open(url, make=False) as catalog:
         if name == "relations":
-            found = catalog.relations(memory, **{w: arguments[w] for w in _TOLD[name][:3]}, k=_MOST_RELATIONS)
+            found = catalog.relations(memory, **{w: arguments[w] for w in _LISTED[name][:3]}, k=_MOST_RELATIONS)
             rows = [r for r in found if r.confidence >= filters.min_confidence]
             _print(rows, found, json, _relation_row, _RELATIONS)
             return

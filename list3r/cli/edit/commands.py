@@ -78,7 +78,7 @@ def undo(
 
     Example: list3r undo house.l3r 41
     """
-    _carry_out(memory, lambda scene: scene.undo(entry, author=author), json)
+    _run_edit(memory, lambda scene: scene.undo(entry, author=author), json)
 
 
 def merge(
@@ -92,7 +92,7 @@ def merge(
 
     Example: list3r merge house.l3r 12 31
     """
-    _carry_out(memory, lambda scene: scene.merge(a, b, author=author), json)
+    _run_edit(memory, lambda scene: scene.merge(a, b, author=author), json)
 
 
 def split(
@@ -115,7 +115,7 @@ def split(
     Example: list3r split house.l3r 12 --out 3:4,5:2
     """
     parts = None if out is None else _parse_parts(out)
-    _carry_out(memory, lambda scene: scene.split(instance_id, parts, author=author), json)
+    _run_edit(memory, lambda scene: scene.split(instance_id, parts, author=author), json)
 
 
 def label(
@@ -129,7 +129,7 @@ def label(
 
     Example: list3r label house.l3r 12 "my mug"
     """
-    _carry_out(memory, lambda scene: scene.label(instance_id, text, author=author), json)
+    _run_edit(memory, lambda scene: scene.label(instance_id, text, author=author), json)
 
 
 def delete(
@@ -139,10 +139,10 @@ def delete(
 
     Example: list3r delete house.l3r 12
     """
-    _carry_out(memory, lambda scene: scene.delete(instance_id, author=author), json)
+    _run_edit(memory, lambda scene: scene.delete(instance_id, author=author), json)
 
 
-def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool) -> None:
+def _run_edit(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool) -> None:
     from list3r.api import open as open_scene
 
     with open_scene(path, writable=True) as scene:

@@ -32,14 +32,14 @@ def cognitive_maps(instances: Sequence[Instance], units: str) -> dict[str, Any]:
     }
 
 
-def _grid(things: Sequence[Instance], part: int, cells: int) -> dict[str, Any]:
-    centers = np.array([i.center[:2] for i in things])
+def _grid(shown: Sequence[Instance], part: int, cells: int) -> dict[str, Any]:
+    centers = np.array([i.center[:2] for i in shown])
     low, high = centers.min(axis=0), centers.max(axis=0)
     side = float((high - low).max()) or 1.0
     origin = (low + high) / 2 - side / 2
     at = np.clip(np.floor((centers - origin) / side * cells), 0, cells - 1).astype(int)
     objects: dict[str, list[list[int]]] = {}
-    for i, cell in zip(things, at.tolist(), strict=True):
+    for i, cell in zip(shown, at.tolist(), strict=True):
         objects.setdefault(name_of(i), []).append(cell)
     return {
         "part": part,
@@ -47,5 +47,5 @@ def _grid(things: Sequence[Instance], part: int, cells: int) -> dict[str, Any]:
         "cell_size": round(side / cells, 6),
         "origin": [round(float(v), 6) for v in origin],
         "objects": objects,
-        "instances": {str(i.id): cell for i, cell in zip(things, at.tolist(), strict=True)},
+        "instances": {str(i.id): cell for i, cell in zip(shown, at.tolist(), strict=True)},
     }

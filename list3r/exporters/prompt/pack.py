@@ -35,7 +35,7 @@ class PackSettings:
     """Budget of the text."""
     question: str | None = None
     """What its words name comes first."""
-    things_on_grids: int = 2000
+    objects_on_grids: int = 2000
     """In a memory of more things the grids of the cognitive map hold only those that have a row in the text."""
     least_visible: float = 0.3
     """Share of an instance that must show for a view to count for it."""
@@ -52,13 +52,13 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
     folder, settings = Path(folder), settings or PackSettings()
     prompt = scene_prompt(memory, settings.tokens, settings.question)
     instances = [i for i in memory.instances(structure=None) if i.state != "removed"]
-    things = {i.id for i in instances if i.structure is None}
-    listed = [n for n in prompt.listed if n in things]
+    objects = {i.id for i in instances if i.structure is None}
+    listed = [n for n in prompt.listed if n in objects]
     with replacing_folder(folder, "prompt") as temporary:
         (temporary / "scene.md").write_text(prompt.text, encoding="utf-8")
-        gridded = things if len(things) <= settings.things_on_grids else set(listed)
+        gridded = objects if len(objects) <= settings.objects_on_grids else set(listed)
         maps = cognitive_maps([i for i in instances if i.id in gridded], memory.units)
-        maps["left_out"] = len(things) - len(gridded)
+        maps["left_out"] = len(objects) - len(gridded)
         (temporary / "cognitive_map.json").write_text(json.dumps(maps, indent=1) + "\n", encoding="utf-8")
         memory.export("plan", temporary / "map.png")
         views = _write_views(memory, temporary / "views", listed, settings)

@@ -125,9 +125,9 @@ def _crops(memory: SceneMemory, instances: list[Instance], settings: ReportSetti
     """Return small JPEGs by id, of those that a stored picture shows."""
     from PIL import Image
 
-    things = [i for i in instances if i.structure is None and i.state != "removed"]
+    objects = [i for i in instances if i.structure is None and i.state != "removed"]
     out = {}
-    for i in sorted(things, key=lambda i: (-i.observations, i.id))[: settings.crops]:
+    for i in sorted(objects, key=lambda i: (-i.observations, i.id))[: settings.crops]:
         try:
             crop = memory.picture(i.id).crop()
         except OptionError:  # no stored picture shows it

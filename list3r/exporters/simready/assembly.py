@@ -59,14 +59,14 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
         raise OptionError(
             f"{store.path.name} has no metric scale, which a simulator needs: `list3r scale --anchor` gives it one"
         )
-    things, structure = _chosen(store, settings)
-    parts = len(things) > settings.one_folder
+    objects, structure = _chosen(store, settings)
+    parts = len(objects) > settings.one_folder
     facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density, parts)
     with replacing_folder(folder, "simready") as temporary, errors_of_disk(folder):
         making = Making(settings.workers, settings.progress)
-        props = write_props(store, things, temporary, facts, making)
-        if settings.ids is not None and len(props) < len(things):
-            bare = sorted({i.id for i in things} - {p.instance_id for p in props})
+        props = write_props(store, objects, temporary, facts, making)
+        if settings.ids is not None and len(props) < len(objects):
+            bare = sorted({i.id for i in objects} - {p.instance_id for p in props})
             raise OptionError(f"{_names_of(bare)}: too few surface points for a mesh; leave it out of the ids")
         fixed = [(i, mesh) for i in structure if (mesh := instance_mesh(store, i)) is not None]
         scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
@@ -82,13 +82,13 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
 def _chosen(store: Store, settings: SimreadySettings) -> tuple[list[Instance], list[Instance]]:
     """Return the things of the main component that become props where they have a mesh, and its structure."""
     there = [i for i in read_components(store)[0].instances if i.state != "removed" and has_box(i)]
-    things = [i for i in there if i.structure is None and not i.dynamic]
+    objects = [i for i in there if i.structure is None and not i.dynamic]
     if settings.ids is not None:
         wanted = {store.instances.get(n).id for n in settings.ids}
-        if bare := sorted(wanted - {i.id for i in things}):
+        if bare := sorted(wanted - {i.id for i in objects}):
             raise OptionError(f"{_names_of(bare)}: structure, gone, moving or placed apart; leave it out of the ids")
-        things = [i for i in things if i.id in wanted]
-    return things, [i for i in there if i.structure is not None]
+        objects = [i for i in objects if i.id in wanted]
+    return objects, [i for i in there if i.structure is not None]
 
 
 def _names_of(ids: Sequence[int]) -> str:

@@ -29,9 +29,9 @@ class Making:
     """Called with how many of the things are done, and how many there are."""
 
 
-def write_props(store: Store, things: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:
+def write_props(store: Store, shown: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:
     """Write a prop below `folder` for each thing whose surface points allow a mesh; in the order of the things."""
-    blocks = [things[n : n + _AT_ONCE] for n in range(0, len(things), _AT_ONCE)]
+    blocks = [shown[n : n + _AT_ONCE] for n in range(0, len(shown), _AT_ONCE)]
     some = ([(i, thinned_support(store, i, MeshSettings().points)) for i in block] for block in blocks)
     workers = making.workers if making.workers is not None else default_workers() if len(blocks) >= 4 else 0
     props, done = [], 0
@@ -39,7 +39,7 @@ def write_props(store: Store, things: Sequence[Instance], folder: Path, facts: P
         props += made
         done += len(block)
         if making.progress is not None:
-            making.progress(done, len(things))
+            making.progress(done, len(shown))
     return props
 
 

@@ -20,7 +20,7 @@ from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_materia
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Instance
 
-_NOT_TOLD = "unknown"
+_NOT_STATED = "unknown"
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _stage(name: str, instance: Instance, mesh: InstanceMesh, T_world_prop: Sim3
         "author": "list3r",
         "asset_name": name,
         "asset_type": "prop",
-        "asset_license": _NOT_TOLD,
+        "asset_license": _NOT_STATED,
         "category": class_token(instance),
         "source_file": facts.source_file,
         "usd_date_generated": facts.date,

@@ -79,10 +79,10 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         in_chunk = unit / float(chunk.S_world_chunk.scale)
         following = store.local_instances.next_id(chunk.chunk_id)
         for cluster in clusters:
-            thing = maker.make(following, cluster)
-            if thing is not None:
-                store.local_instances.add(chunk.chunk_id, thing)
-                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, standing, in_chunk, s))
+            obj = maker.make(following, cluster)
+            if obj is not None:
+                store.local_instances.add(chunk.chunk_id, obj)
+                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(obj, nodes, standing, in_chunk, s))
                 following += 1
                 added += 1
     return added
@@ -103,11 +103,11 @@ def _clusters(points: Array, unit: float, s: ChangedPlaceSettings) -> list[Ints]
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
     _, label = connected_components(graph, directed=False)
     rows = [np.flatnonzero(label == n) for n in range(int(label.max()) + 1)]
-    kept = [r for r in rows if _is_thing(points[r], unit, s)]
+    kept = [r for r in rows if _is_object(points[r], unit, s)]
     return sorted(kept, key=lambda r: (-len(r), int(r[0])))
 
 
-def _is_thing(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
+def _is_object(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
     sides = np.sort(np.ptp(points, axis=0))
     large = float(np.linalg.norm(sides)) > s.largest_m * unit
     return len(points) >= s.least_cells and sides[1] >= s.least_side_m * unit and not large
@@ -166,7 +166,7 @@ def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[
 
 
 def _mixed_with(
-    thing: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
+    obj: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
 ) -> list[tuple[int, int]]:
     """Pairs of a thing with the chunk's instances that hold part of it beside what stayed: they are not this thing."""
     reach = 1.5 * s.voxel_m * unit
@@ -174,9 +174,9 @@ def _mixed_with(
     for node, stands in zip(nodes, standing, strict=True):
         if stands or len(node.support.points) == 0:
             continue
-        covered = cKDTree(node.support.points).query(thing.support.points, distance_upper_bound=reach)[0] < np.inf
+        covered = cKDTree(node.support.points).query(obj.support.points, distance_upper_bound=reach)[0] < np.inf
         if float(np.mean(covered)) >= s.mixed:
-            out.append((node.local_id, thing.local_id))
+            out.append((node.local_id, obj.local_id))
     return out
 
 

@@ -25,7 +25,7 @@ class ChangedPlaceSettings:
 
     voxel_m: float = 0.02
     """Edge of the cells in which a chunk's surfaces are asked about."""
-    least_told: int = 2
+    least_frames: int = 2
     """Frames of the other session that must see through a surface, and of its own that must see it."""
     free_share: float = 0.7
     """Share of the other session's frames that tell about a surface and must see through it."""
@@ -95,7 +95,7 @@ def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: C
             free[rows[seen == FREE]] += 1
         counts[name] = met, free
     met, free = counts["own"]
-    sure = (met >= s.least_told) & (free <= s.own_free * met)
+    sure = (met >= s.least_frames) & (free <= s.own_free * met)
     return CarvedSurfaces(points, counts["others"][1], counts["others"][0], sure)
 
 
@@ -142,10 +142,10 @@ def _cells(
 
 def gone(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     """Return the surfaces that the other sessions see through. Shape (N, 3)."""
-    through = (seen.free >= s.least_told) & (seen.free >= s.free_share * (seen.free + seen.met))
+    through = (seen.free >= s.least_frames) & (seen.free >= s.free_share * (seen.free + seen.met))
     return np.asarray(seen.points[seen.own & through])
 
 
 def compared(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     """Return the surfaces that the other sessions see or see through. Shape (K, 3)."""
-    return np.asarray(seen.points[seen.free + seen.met >= s.least_told])
+    return np.asarray(seen.points[seen.free + seen.met >= s.least_frames])

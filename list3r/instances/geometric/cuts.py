@@ -61,9 +61,9 @@ class CloudDiscoverer(ABC):
         views = chunk_views(frames, reconstruction, self.settings)
         if views is not self._views or self._cut is None:
             self._views, self._cut = views, self._segment(views)
-        return self.looked_at(reconstruction, position, *self._cut[1:])
+        return self.propose(reconstruction, position, *self._cut[1:])
 
-    def looked_at(
+    def propose(
         self, reconstruction: Reconstruction, position: int, cut: Segmentation, features: NDArray[np.float32]
     ) -> Proposals:
         """A cut of the cloud of the chunk in hand, as the frame at `position` sees it."""

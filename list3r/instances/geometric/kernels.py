@@ -29,7 +29,7 @@ def read_across(
 
 
 @compiled
-def carry_labels(
+def propagate_labels(
     depth: Float,
     camera: Intrinsics,
     T_source_cam: Float,

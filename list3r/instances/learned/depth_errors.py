@@ -52,7 +52,7 @@ def voxel_doubt(views: ChunkViews, cloud: Cloud) -> NDArray[np.float32]:
     return np.asarray(total / np.maximum(count, 1.0), np.float32)
 
 
-def without_bends(
+def without_depth_bends(
     surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane], doubt: NDArray[np.float32], s: DepthErrorSettings
 ) -> CloudCut:
     """Return the cut with what is a patch of a wall or floor joined to it: what lies in the plane of a structure within

@@ -17,9 +17,9 @@ from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.planes import Plane, estimate_up, find_planes
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
-from list3r.instances.learned.depth_errors import DepthErrorSettings, voxel_doubt, without_bends, without_slivers
+from list3r.instances.learned.depth_errors import DepthErrorSettings, voxel_doubt, without_depth_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
-from list3r.instances.learned.things import ThingVerdicts, names_of
+from list3r.instances.learned.verdicts import SegmentVerdicts, names_of
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
 from list3r.reconstruction.base import Reconstruction
@@ -46,7 +46,7 @@ class LearnedSettings:
     least_confidence_computed: float = 0.4
     """... where depth was computed from pictures; anything from 0.3 to 0.5 does as well on left-out rooms
     (research/discovery 0201)."""
-    least_scrap: float = 0.1
+    least_whole: float = 0.1
     """Things that are less probably one whole are not even kept."""
     plane_area_m2: float = 0.25
     """Smallest flat surface looked for, from which gravity is told and structure is parted."""
@@ -67,13 +67,13 @@ class LearnedDiscoverer(CloudDiscoverer):
         super().__init__(settings)
         self._learned = learned or LearnedSettings()
         self._weights = {sensed: load_weights(weights, sensed=sensed) for sensed in (True, False)}
-        self._scraps: tuple[Segmentation, Features] | None = None
+        self._low_confidence: tuple[Segmentation, Features] | None = None
 
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Propose masks on the frame at `position`, best first, with the probability that each is one thing."""
         found = super().__call__(frames, reconstruction, position)
-        scraps = None if self._scraps is None else self.looked_at(reconstruction, position, *self._scraps)
-        return replace(found, whole=found.score, scraps=scraps)
+        unsure = None if (cut := self._low_confidence) is None else self.propose(reconstruction, position, *cut)
+        return replace(found, whole=found.score, low_confidence=unsure)
 
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, Features]:
         settings = self.settings.segment
@@ -87,7 +87,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         up = estimate_up(planes, poses)
         height = float(np.median(poses[:, :3, 3] @ up))
         if not len(cloud.keys):
-            self._scraps = None
+            self._low_confidence = None
             return cloud, Segmentation(np.zeros(0, np.int32), (), up), np.zeros((0, 64), np.float32)
         around = Surroundings(up, views.unit, height, computed)
         surface = chunk_surface(cloud, shown, around)
@@ -99,8 +99,8 @@ class LearnedDiscoverer(CloudDiscoverer):
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(weights)
         kept, features = _described(cloud, parted, up, views.unit, names)
-        scraps = cut.only(~listed & (cut.verdicts.whole >= self._learned.least_scrap))
-        self._scraps = _described(cloud, scraps, up, views.unit, names)
+        unsure = cut.only(~listed & (cut.verdicts.whole >= self._learned.least_whole))
+        self._low_confidence = _described(cloud, unsure, up, views.unit, names)
         return cloud, kept, features
 
     def _as_sure_as_depth(
@@ -108,7 +108,7 @@ class LearnedDiscoverer(CloudDiscoverer):
     ) -> CloudCut:
         """The cut without what errors of computed depth explain."""
         s, doubt = self._learned.depth_errors, voxel_doubt(views, surface.cloud)
-        cut = without_bends(surface, cut, planes, doubt, s)
+        cut = without_depth_bends(surface, cut, planes, doubt, s)
         return without_slivers(surface.cloud, cut, doubt, s, 0.5 * self._learned.least_confidence_computed)
 
 
@@ -147,13 +147,13 @@ def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> li
     return faces
 
 
-def _named(told: ThingVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
+def _named(scores: SegmentVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
     """The likeliest names of each thing with their probabilities; none for structure.
 
     Unsure ones are told, too: what a thing is called is decided when all chunks have spoken.
     """
     out: list[tuple[tuple[str, float], ...]] = []
-    for row, structure in zip(told.names, told.structure, strict=True):
+    for row, structure in zip(scores.names, scores.structure, strict=True):
         best = np.argsort(-row, kind="stable")[:MOST_NAMES]
         likely = [(names[k], round(float(row[k]), 4)) for k in best if row[k] >= LEAST_NAME]
         out.append(tuple(likely) if structure <= 0.5 else ())

@@ -42,8 +42,8 @@ def classify(weights: Weights, prefix: str, graph: PieceGraph) -> Classification
         layer = f"layers.{k}"
         m = w.linear(f"{layer}.here", h)[target] + w.linear(f"{layer}.there", h)[source] + w.linear(f"{layer}.way", e)
         m = np.maximum(m, 0.0)
-        told = np.concatenate([h, sums.mean(m), sums.most(m)], axis=1)
-        h = w.norm(f"{layer}.norm", h + w.two(f"{layer}.update", told))
+        scores = np.concatenate([h, sums.mean(m), sums.most(m)], axis=1)
+        h = w.norm(f"{layer}.norm", h + w.two(f"{layer}.update", scores))
         e = w.norm(f"{layer}.edge_norm", e + w.linear(f"{layer}.edge_update", m))
     half = len(graph.left)
     a, b = h[graph.left], h[graph.right]

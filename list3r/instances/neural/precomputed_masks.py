@@ -25,7 +25,7 @@ from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.precomputed import open_folder
 from list3r.reconstruction.precomputed_files import Piece, read_piece
 
-MOST_THINGS = 1_000_000
+MOST_OBJECTS = 1_000_000
 """Things of one file; numbers of different files are kept apart by this."""
 
 
@@ -80,7 +80,7 @@ class PrecomputedMasks:
             score=np.ones(len(numbers), np.float32),
             features=np.divide(features, length, out=np.zeros_like(features), where=length > 0),
             plane=np.full((len(numbers), 4), np.nan),
-            identity=numbers + MOST_THINGS * file,
+            identity=numbers + MOST_OBJECTS * file,
         )
 
     def _checked(self, k: int) -> NDArray[np.float32] | None:
@@ -90,8 +90,8 @@ class PrecomputedMasks:
         if piece.masks is None:
             raise OptionError(f"{path} has no masks, which --discovery precomputed needs")
         least, most = int(piece.masks.min(initial=0)), int(piece.masks.max(initial=0))
-        rows = MOST_THINGS - 1 if piece.features is None else len(piece.features)
-        if least < 0 or most > min(rows, MOST_THINGS - 1):
+        rows = MOST_OBJECTS - 1 if piece.features is None else len(piece.features)
+        if least < 0 or most > min(rows, MOST_OBJECTS - 1):
             raise OptionError(f"{path}: masks hold things {least} to {most}; features has {rows} rows")
         return None if piece.features is None else np.nan_to_num(piece.features)
 

@@ -71,19 +71,19 @@ class VideoTracker:
         """Follow all candidates through the posed frames, forwards and backwards; keep the stable tracks."""
         views = chunk_views(frames, reconstruction, self._settings)
         order = np.flatnonzero(reconstruction.posed).tolist()
-        things = _Things(proposals, views, self._tracker)
-        for position, masks in self._sweep(frames, order, things, forwards=True):
-            things.keep(position, masks)
-        if things.late:
-            for position, masks in self._sweep(frames, order[::-1], things, forwards=False):
-                things.keep(position, masks)
-        images = [things.labels(p.position) for p in proposals]
-        supports = collect_supports(views, proposals, images, things.count, self._settings.track.support_points)
-        chunk = LabelledChunk(views, proposals, things.joined, supports, self._settings)
-        return chunk.library(things.labels, feature_space)
+        tracked = _Objects(proposals, views, self._tracker)
+        for position, masks in self._sweep(frames, order, tracked, forwards=True):
+            tracked.keep(position, masks)
+        if tracked.late:
+            for position, masks in self._sweep(frames, order[::-1], tracked, forwards=False):
+                tracked.keep(position, masks)
+        images = [tracked.labels(p.position) for p in proposals]
+        supports = collect_supports(views, proposals, images, tracked.count, self._settings.track.support_points)
+        chunk = LabelledChunk(views, proposals, tracked.joined, supports, self._settings)
+        return chunk.library(tracked.labels, feature_space)
 
     def _sweep(
-        self, frames: Sequence[Frame], order: Sequence[int], things: _Things, *, forwards: bool
+        self, frames: Sequence[Frame], order: Sequence[int], tracked: _Objects, *, forwards: bool
     ) -> Iterator[tuple[int, dict[int, NDArray[np.float32]]]]:
         """Logits (h, w) of every followed thing at working size, frame by frame in the given order."""
         import torch
@@ -92,12 +92,12 @@ class VideoTracker:
         with torch.inference_mode():
             for position in order:
                 picture = network_input(frames[position].color, self._shape, self._device, self._network.dtype)
-                found = state.step(picture, position, things.shape, reverse=not forwards)
-                prompts = things.prompts(position, found, forwards=forwards)
+                found = state.step(picture, position, tracked.shape, reverse=not forwards)
+                prompts = tracked.prompts(position, found, forwards=forwards)
                 if prompts:
-                    state, prompts = self._with_room(state, prompts, found, things, frames)
+                    state, prompts = self._with_room(state, prompts, found, tracked, frames)
                     state.prompt(prompts, position, self._shape)
-                    found = state.step(picture, position, things.shape, reverse=not forwards)
+                    found = state.step(picture, position, tracked.shape, reverse=not forwards)
                 state.forget(position)
                 yield position, found
 
@@ -106,14 +106,14 @@ class VideoTracker:
         state: _State,
         prompts: dict[int, NDArray[np.bool_]],
         found: Mapping[int, NDArray[np.float32]],
-        things: _Things,
+        tracked: _Objects,
         frames: Sequence[Frame],
     ) -> tuple[_State, dict[int, NDArray[np.bool_]]]:
         """Return the session that follows the prompts too, and the prompts: a new one where there would be too many."""
         if len(state.objects | prompts.keys()) <= self._tracker.most_live:
             return state, prompts
         live = {**{k: v > 0 for k, v in found.items() if (v > 0).any()}, **prompts}
-        return _State(self._new_session(frames), self._network), things.most_wanted(live)
+        return _State(self._new_session(frames), self._network), tracked.most_wanted(live)
 
     def _new_session(self, frames: Sequence[Frame]) -> Any:
         import transformers
@@ -193,7 +193,7 @@ class _State:
                 del kept[old]
 
 
-class _Things:
+class _Objects:
     """What is followed: which candidate belongs to which thing, and where each thing was seen."""
 
     def __init__(self, proposals: Sequence[Proposals], views: ChunkViews, settings: VideoTrackerSettings) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.simulation.rendering.projection import NEAR_M, SolidScene, screen_rectangles
 from list3r.simulation.rendering.shading import ContactShadows, Lighting, TextureAtlas, illumination, surface
-from list3r.simulation.worlds.things import BOX, CYLINDER, SimulatedThing, stack_solids
+from list3r.simulation.worlds.objects import BOX, CYLINDER, SimulatedObject, stack_solids
 from list3r.simulation.worlds.world import SimulatedWorld
 
 Array = NDArray[np.float64]
@@ -45,15 +45,15 @@ class Renderer:
         self,
         world: SimulatedWorld,
         camera: Camera,
-        moving: Sequence[SimulatedThing] = (),
+        moving: Sequence[SimulatedObject] = (),
         lighting: Lighting | None = None,
     ) -> None:
         self._world, self._lighting = world, lighting or Lighting()
         self._camera = camera
-        self.scene = SolidScene(world.things, moving)
+        self.scene = SolidScene(world.objects, moving)
         self._solids = self.scene.solids
         self._atlas = TextureAtlas(self._solids)
-        self._shadows = ContactShadows(world, stack_solids(world.things))
+        self._shadows = ContactShadows(world, stack_solids(world.objects))
         self._x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         self._y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
 
@@ -69,7 +69,7 @@ class Renderer:
         color, ids = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.int32)
         incidence = np.zeros(shape, np.float32)
         color.reshape(-1, 3)[hit] = shaded
-        ids.ravel()[hit], incidence.ravel()[hit] = self._solids.thing[seen], cosine
+        ids.ravel()[hit], incidence.ravel()[hit] = self._solids.object_id[seen], cosine
         self._smooth_edges(T_world_cam, solid, rects[1], color)
         return RenderedFrame(color, np.where(solid >= 0, depth, 0).astype(np.float32), ids, incidence)
 

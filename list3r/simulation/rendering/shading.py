@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.simulation.worlds.layout import Room
 from list3r.simulation.worlds.materials import TEXTURE_PX, bake, mip_levels
-from list3r.simulation.worlds.things import BOX, Solids
+from list3r.simulation.worlds.objects import BOX, Solids
 from list3r.simulation.worlds.world import HEIGHT_M, SimulatedWorld
 
 Floats = NDArray[np.float32]
@@ -82,10 +82,10 @@ class ContactShadows:
     """Soft darkness on floors and table tops under and beside what stands on them or hangs low above them."""
 
     def __init__(self, world: SimulatedWorld, solids: Solids) -> None:
-        supports = {t.support for t in world.things if t.support is not None and t.container is None}
+        supports = {t.support for t in world.objects if t.support is not None and t.container is None}
         tops = {0.0} | {
             round(float(t.box().center[2] + t.box().size[2] / 2), 3)
-            for t in world.things
+            for t in world.objects
             if t.id in supports and t.structure is None
         }
         self._heights = np.array(sorted(tops))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, Vec3
+from list3r.simulation.worlds.objects import BOX, CYLINDER, SPHERE, Part, Vec3
 
 Parts = tuple[Part, ...]
 

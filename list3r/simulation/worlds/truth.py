@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.simulation.worlds.gaps import surface_gap
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.world import SimulatedWorld
 
 NEXT_TO_M = (0.1, 0.4)
@@ -30,26 +30,26 @@ def world_truth(world: SimulatedWorld, seen: dict[int, dict[str, int]] | None = 
         "version": 1,
         "seed": world.seed,
         "frame": {"up": [0, 0, 1], "units": "m", "metric": "metric", "gravity": "known"},
-        "instances": [_instance(t, (seen or {}).get(t.id, {})) for t in world.things],
+        "instances": [_instance(t, (seen or {}).get(t.id, {})) for t in world.objects],
         "relations": [{"subject": s, "predicate": p, "object": o} for s, p, o in true_relations(world)],
     }
 
 
-def _instance(thing: SimulatedThing, seen: dict[str, int]) -> dict[str, Any]:
-    box = thing.box()
+def _instance(obj: SimulatedObject, seen: dict[str, int]) -> dict[str, Any]:
+    box = obj.box()
     return {
-        "id": thing.id,
-        "label": thing.label,
-        "structure": thing.structure is not None,
-        "round": thing.is_round(),
+        "id": obj.id,
+        "label": obj.label,
+        "structure": obj.structure is not None,
+        "round": obj.is_round(),
         "box": {
             "center": rounded(box.center),
             "size": rounded(box.size),
             "quat_wxyz": rounded(quat_wxyz_from_rotation(box.rotation)),
         },
-        "support": thing.support,
-        "container": thing.container,
-        "attached": thing.attached,
+        "support": obj.support,
+        "container": obj.container,
+        "attached": obj.attached,
         "frames_seen": seen.get("frames", 0),
         "largest_px": seen.get("largest_px", 0),
     }
@@ -62,22 +62,22 @@ def true_relations(world: SimulatedWorld) -> list[tuple[int, str, int]]:
     `next_to` the same among those that share heights. Rugs are next to nothing: what touches them stands on them.
     """
     triples: list[tuple[int, str, int]] = []
-    for thing in world.things:
-        if thing.container is not None:
-            triples.append((thing.id, "in", thing.container))
-        elif thing.support is not None:
-            triples.append((thing.id, "on", thing.support))
-        if thing.attached is not None:
-            triples.append((thing.id, "attached_to", thing.attached))
-    things = [t for t in world.things if t.structure is None]
-    for k, a in enumerate(things):
-        for b in things[:k]:
+    for obj in world.objects:
+        if obj.container is not None:
+            triples.append((obj.id, "in", obj.container))
+        elif obj.support is not None:
+            triples.append((obj.id, "on", obj.support))
+        if obj.attached is not None:
+            triples.append((obj.id, "attached_to", obj.attached))
+    objects = [t for t in world.objects if t.structure is None]
+    for k, a in enumerate(objects):
+        for b in objects[:k]:
             for predicate in _close(a, b):
                 triples += [(a.id, predicate, b.id), (b.id, predicate, a.id)]
     return sorted(triples)
 
 
-def _close(a: SimulatedThing, b: SimulatedThing) -> list[str]:
+def _close(a: SimulatedObject, b: SimulatedObject) -> list[str]:
     """Return which of near and next_to two things are."""
     if a.id in (b.support, b.container) or b.id in (a.support, a.container):
         return []

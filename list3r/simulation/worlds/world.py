@@ -9,7 +9,7 @@ import numpy as np
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, Room, furnish_bedroom, furnish_living_room, wall_paint
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import SimulatedThing, Vec3
+from list3r.simulation.worlds.objects import SimulatedObject, Vec3
 
 WALL_M = 0.10
 DOOR_M = (0.95, 2.05)
@@ -31,13 +31,13 @@ class SimulatedWorld:
 
     seed: int
     rooms: tuple[Room, ...]
-    things: tuple[SimulatedThing, ...]
+    objects: tuple[SimulatedObject, ...]
     tour: tuple[Stop, ...]
     """A round through both rooms that comes back to where it starts."""
 
-    def thing(self, thing_id: int) -> SimulatedThing:
+    def object_of(self, object_id: int) -> SimulatedObject:
         """Return the thing of an id. Raises `KeyError`."""
-        return {t.id: t for t in self.things}[thing_id]
+        return {t.id: t for t in self.objects}[object_id]
 
 
 def make_world(seed: int = 0) -> SimulatedWorld:
@@ -50,7 +50,7 @@ def make_world(seed: int = 0) -> SimulatedWorld:
     floors, walls = _shell(placer, (living, bedroom))
     furnish_living_room(placer, living, walls[0], floors[0])
     furnish_bedroom(placer, bedroom, walls[1], floors[1])
-    return SimulatedWorld(seed, (living, bedroom), tuple(placer.things), _tour(living, bedroom))
+    return SimulatedWorld(seed, (living, bedroom), tuple(placer.objects), _tour(living, bedroom))
 
 
 def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[str, int]]]:

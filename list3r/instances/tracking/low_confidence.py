@@ -15,7 +15,7 @@ from list3r.instances.tracking.reprojection import LabelledChunk
 from list3r.memory.records import LocalInstance
 
 
-def scrap_instances(
+def low_confidence_instances(
     views: ChunkViews, proposals: Sequence[Proposals], settings: InstanceSettings, first_id: int
 ) -> tuple[LocalInstance, ...]:
     """Return the scraps of a chunk, with local ids from `first_id` on; a discoverer tells them by `identity`.
@@ -25,7 +25,7 @@ def scrap_instances(
     numbered = [(p, identity_of(p)) for p in proposals if len(p.score)]
     if not numbered:
         return ()
-    kept, numbers, s = [p for p, _ in numbered], [n for _, n in numbered], settings.scraps
+    kept, numbers, s = [p for p, _ in numbered], [n for _, n in numbered], settings.low_confidence
     count = 1 + max(int(n.max()) for n in numbers)
     stride, images = views.stride, dict[int, NDArray[np.int32]]()
     for p, n in numbered:

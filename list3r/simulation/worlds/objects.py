@@ -46,7 +46,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class SimulatedThing:
+class SimulatedObject:
     """One physical thing with what is true of it."""
 
     id: int
@@ -83,10 +83,10 @@ class SimulatedThing:
 
 
 @dataclass(frozen=True)
-class MovingThing:
+class MovingObject:
     """A thing with a pose of its own in every frame."""
 
-    thing: SimulatedThing
+    obj: SimulatedObject
     """At the origin."""
     T_world_object: Array
     """Upright poses. Shape (F, 4, 4)."""
@@ -108,7 +108,7 @@ class Solids:
     """Shape (N,)."""
     material: NDArray[np.int64]
     """Index into `materials`. Shape (N,)."""
-    thing: NDArray[np.int64]
+    object_id: NDArray[np.int64]
     """Id of the thing. Shape (N,)."""
     materials: tuple[Material, ...]
 
@@ -123,9 +123,9 @@ class Solids:
         return np.asarray(turned + self.center[:, None, :])
 
 
-def stack_solids(things: Sequence[SimulatedThing]) -> Solids:
+def stack_solids(objects: Sequence[SimulatedObject]) -> Solids:
     """Return the parts of all things in the world frame."""
-    pairs = [(thing, part) for thing in things for part in thing.parts]
+    pairs = [(obj, part) for obj in objects for part in obj.parts]
     materials = tuple(dict.fromkeys(part.material for _, part in pairs))
     index = {material: k for k, material in enumerate(materials)}
     return Solids(
@@ -135,6 +135,6 @@ def stack_solids(things: Sequence[SimulatedThing]) -> Solids:
         yaw=np.array([t.yaw + p.yaw for t, p in pairs]),
         open_top=np.array([p.open_top for _, p in pairs]),
         material=np.array([index[p.material] for _, p in pairs]),
-        thing=np.array([t.id for t, _ in pairs]),
+        object_id=np.array([t.id for t, _ in pairs]),
         materials=materials,
     )
