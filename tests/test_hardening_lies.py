@@ -98,7 +98,7 @@ SOME = {
 }
 
 
-@pytest.mark.parametrize("told", SOME)
+@pytest.mark.parametrize("message", SOME)
 def test_a_lie_is_one_line_that_names_table_and_row(
     message: str, hostile: SimpleNamespace, rich: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
