@@ -1,14 +1,13 @@
-"""The main job by two versions of the program, in turns on one machine: how many times as fast, and whether as good.
+"""A build by two versions of the program, in turns on one machine: ratio of speed, and quality.
 
     git worktree add --detach ../before 3aa3245
     PYTHONPATH=. python benchmarks/build_pair.py --before ../before --source ../shared/data/redkitchen --json FILE
     PYTHONPATH=. python benchmarks/build_pair.py --before ../before --source ../shared/data/redkitchen \\
         --colour-only --intrinsics 525,525,320,240 --json FILE
 
-Each version builds the same pictures with two workers, once unmeasured on a few frames, so that its machine code is
-compiled, then `--rounds` times. Both memories are opened by this version. Times are of the whole program, from its
-start to its end. Frames per second of different machines cannot be compared; what one version takes by what the other
-takes in the same run can.
+Each version builds the same pictures with two workers, once on a few frames for warm-up, then `--rounds` times. Both
+memories are opened by this version. Times are of the whole program, from its start to its end. Frames per second of
+different machines cannot be compared; the ratio of two versions in one run can.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""A catalogue of many memories as it grows: what loading, adding a memory and asking costs, how many of the nearest
-vectors are found, many at once, a server that is killed, and the catalogue written anew from files.
+"""A growing catalogue of many memories: cost of loading, adding a memory and queries, recall of the nearest vectors,
+concurrent clients, a killed server, and rebuilding from files.
 
 python benchmarks/catalog.py --postgres --busy-s 300 --json benchmarks/results/catalog.json
 python benchmarks/catalog.py --stages 5,50 --json catalog-sqlite.json        # the embedded catalogue
 
-The server is the benchmark's own, from the distribution's package with pgvector. Memories are made up and handed to the
-catalogue as the reader of files does; `--files` of them are real files. Wall times hold for a machine of its own alone:
-beside them stands processor time, of this process and of the server's that answers it.
+The server is the benchmark's own, from the distribution's package with pgvector. Memories are synthetic and passed in
+as the reader of files does; `--files` of them are real files. Wall times are valid on an idle machine only; processor
+time, of this process and of its server process, is given too.
 """
 
 from __future__ import annotations
@@ -46,10 +46,9 @@ SPACES = {
     "benchmark even@1/{}": (0.0, 3000),
     "benchmark lone@1/{}": (1.0, 0),
 }
-"""Vectors, by how their variances fall and how many kinds of look there are. Of learned ones the variance of the n-th
-number is about 1 / n (Agrawal et al. 2022, alpha-ReQ), and things of one kind lie together: the first. Beside it such
-as vary alike in all directions, in which a graph of neighbours loses its way, and such as lie nowhere together, which
-lists divide badly."""
+"""Vectors, by the decay of their variances and the number of clusters of appearance. Of learned ones the variance of
+the n-th number is about 1 / n (Agrawal et al. 2022, alpha-ReQ), with clusters: the first. The others are isotropic,
+hard for a graph index, and without clusters, hard for inverted lists."""
 COLORS = ("red", "blue", "green", "white", "black", "grey", "brown", "yellow")
 KINDS = tuple(f"kind{n}" for n in range(400))
 SERVER = "-c shared_buffers=2GB -c max_wal_size=4GB -c max_parallel_maintenance_workers=0"
@@ -64,7 +63,7 @@ def main() -> None:
     words.add_argument("--instances", type=int, default=2000)
     words.add_argument("--dimension", type=int, default=64)
     words.add_argument("--questions", type=int, default=200)
-    words.add_argument("--files", type=int, default=5, help="Real files that are taken in, and anew.")
+    words.add_argument("--files", type=int, default=5, help="Real files that are added, and rebuilt.")
     words.add_argument("--busy-s", type=float, default=0.0, help="So long 16 ask while 4 write.")
     words.add_argument("--json", type=Path)
     asked = words.parse_args()
@@ -83,7 +82,7 @@ def _started(postgres: bool) -> Iterator[tuple[str, PostgresServer | None]]:
 
 
 class Growth:
-    """A catalogue that grows from stage to stage, and what was measured."""
+    """A catalogue that grows from stage to stage, and its measurements."""
 
     def __init__(self, url: str, server: PostgresServer | None, asked: argparse.Namespace) -> None:
         self._url, self._server, self._asked = url, server, asked
@@ -142,7 +141,7 @@ class Growth:
         return row
 
     def _put(self, server: int) -> dict[str, float]:
-        """Add a memory of 1,000 three times, each of other things."""
+        """Add a memory of 1,000 three times, each of other objects."""
         looks = {self._space: self._looks[self._space]}
         contents = [make_content(f"small{n}", 1000, looks, self._chance) for n in range(3)]
         found = _timed(lambda n: self._backend.put(contents[n]), 3, server, warm=0)
@@ -188,7 +187,7 @@ class Growth:
         return hits / 500
 
     def _from_files(self) -> dict[str, Any]:
-        """Real files are taken in, asked, written anew and asked again."""
+        """Real files are added, queried, rewritten and queried again."""
         size, names = self._asked.instances, [f"file{n}" for n in range(self._asked.files)]
         with tempfile.TemporaryDirectory() as folder:
             paths = [Path(folder) / f"{name}.l3r" for name in names]
@@ -323,7 +322,7 @@ class Growth:
 
 
 class Looks:
-    """Vectors of one space: things about some kinds of look, or each of a look of its own where there are none."""
+    """Vectors of one space: objects in clusters of appearance, or each by itself without clusters."""
 
     def __init__(self, dimension: int, decay: float, kinds: int, chance: np.random.Generator) -> None:
         """Let the variance of the n-th number be n to the power of -decay."""
@@ -331,11 +330,11 @@ class Looks:
         self._kinds = chance.normal(size=(kinds, dimension)) * self._spread if kinds else np.zeros((1, dimension))
 
     def of(self, count: int, chance: np.random.Generator) -> Vectors:
-        """Return the vectors of so many things, of unit length."""
+        """Return the vectors of so many objects, of unit length."""
         return self._about(chance.integers(0, len(self._kinds), count), chance)
 
     def near(self, number: int) -> Vectors:
-        """Return the vector of a thing, the same for the same number."""
+        """Return the vector of an object, the same for the same number."""
         return self._about(np.array([number % len(self._kinds)]), np.random.default_rng(number))[0]
 
     def _about(self, kinds: NDArray[np.int64], chance: np.random.Generator) -> Vectors:
@@ -344,7 +343,7 @@ class Looks:
 
 
 def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.random.Generator) -> MemoryContent:
-    """A memory of things of random places, names, looks and relations."""
+    """A memory of objects with random places, names, appearances and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
     instances = []

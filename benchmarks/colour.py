@@ -5,14 +5,13 @@
 
 Each walk (two furnished rooms, 640x480, filmed at 12 frames a second) becomes a folder of its colour pictures, and
 `list3r build FOLDER --reconstruction sfm --intrinsics ...` a memory. `blank` is the share of 7 px windows, at 320 px
-width, whose deviation is below 2.5 grey levels: 0.20 in redkitchen. Things are matched one to one, by masks in every
-tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` says what the things lie on that match
-nothing. `things_scale` is the scale of the world by the middles of the things that are matched at IoU 0.5, over that
-by the cameras: 1 where things lie where the cameras saw them. Relations are those among things matched by masks.
-Walks and reconstructions that are in `--keep` are used again, and then the time is that of what is left.
-With `--rooms` the walks are 300 frames of left-out rooms of `training/worlds`, in which the camera turns where it
-stands; their relations are not known. With `--step METRES` they are those of `wide_walks.py`, which says what is
-measured of them.
+width, with a deviation below 2.5 grey levels: 0.20 in redkitchen. Objects are matched one to one, by masks in every
+tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` classifies objects without a match by the
+surface they are on. `things_scale` is the scale of the world by the centres of objects matched at IoU 0.5, over that by
+the cameras. Relations are those among objects matched by masks. Walks and reconstructions in `--keep` are reused, and
+the time is that of the rest. With `--rooms` the walks are 300 frames of left-out rooms of `training/worlds`, with a
+camera that turns on the spot; their relations are not known. With `--step METRES` they are those of `wide_walks.py`,
+with its figures.
 """
 
 from __future__ import annotations
@@ -44,13 +43,13 @@ from list3r.simulation.dataset import DEPTH_UNITS_PER_M, WalkSettings, write_wal
 
 SIZE = (640, 480)
 EVERY = 10
-"""Frames between those whose masks are compared."""
+"""Frames between two frames with compared masks."""
 STEP = 4
 """Every so many pixels of a mask are compared."""
 ROOM_FRAMES = 300
 """Frames of a walk through a left-out room."""
 LEAST_PX = 150
-"""True things that never cover so many pixels count neither way."""
+"""True objects that never cover so many pixels count neither way."""
 
 Masks = dict[int, dict[int, NDArray[np.bool_]]]
 """By frame and id, thinned by `STEP`."""
@@ -82,7 +81,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--discovery", default="", help="such as learned,sam2; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
-    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
+    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, next to plain pycolmap")
     parser.add_argument("--hard", action="store_true", help="... with wider turns, and through door frames")
     parser.add_argument("--frames", type=int, help="of each walk; without it 150 of such walks, else all")
     parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")
@@ -205,7 +204,7 @@ def depth_errors(reconstructions: Path, walk: Path) -> dict[str, float]:
 
 
 def scene_errors(memory: Path, walk: Path) -> dict[str, Any]:
-    """Trajectory, things and relations of a memory."""
+    """Trajectory, objects and relations of a memory."""
     true_scene = read_scene(walk / "truth.json")
     exported = memory.with_suffix(".json")
     with open_memory(memory) as opened:
@@ -242,7 +241,7 @@ def _alignment(memory: Path, walk: Path) -> tuple[Sim3, float]:
 def _objects_scale(
     scene: Mapping[str, Any], truth: Mapping[str, Any], found: list[tuple[int, int, float]], S_truth_world: Sim3
 ) -> float | None:
-    """Scale from the memory's world to the truth's by the middles of things, over that by the cameras."""
+    """Scale from the memory's world to the truth's by the middles of objects, over that by the cameras."""
     boxes, true_boxes = scene_boxes(scene), scene_boxes(truth)
     pairs = [(boxes[e].center, true_boxes[t].center) for t, e, iou in found if iou >= 0.5]
     if len(pairs) < 4:
@@ -252,7 +251,7 @@ def _objects_scale(
 
 
 def true_masks(walk: Path, frames: range) -> Masks:
-    """What is truly seen where."""
+    """True objects and their masks."""
     out: Masks = {}
     for frame in frames:
         ids = cv2.imread(str(walk / "ids" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
@@ -263,7 +262,7 @@ def true_masks(walk: Path, frames: range) -> Masks:
 
 
 def memory_masks(memory: Path, frames: range) -> Masks:
-    """What a memory saw where, all chunks together."""
+    """Instances of a memory and their masks, all chunks together."""
     out: Masks = {frame: {} for frame in frames}
     with Store.open(memory) as store:
         present = {i.id for i in store.instances.all()}
@@ -297,8 +296,8 @@ def compare_masks(truth: Masks, found: Masks) -> Overlaps:
 def _by_masks(
     overlaps: Overlaps, scene: Mapping[str, Any], truth: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[tuple[int, int, float]]]:
-    """Recall and precision of things by masks, what false ones lie on, relations of the true ones; and the pairs
-    (true id, id, IoU) at IoU 0.25.
+    """Recall and precision of objects by masks, the surfaces under false ones, relations of the true ones; and the
+    pairs (true id, id, IoU) at IoU 0.25.
     """
     wanted = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= LEAST_PX}
     objects = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
@@ -324,7 +323,8 @@ def _by_masks(
 def _false_objects(
     overlaps: Overlaps, columns: list[int], found: list[tuple[int, int, float]], truth: Mapping[str, Any]
 ) -> dict[str, int]:
-    """How many things that match nothing lie mostly on structure, on a thing that is found, and on one that is not."""
+    """How many objects that match nothing are mostly on structure, on an object that is found, and on one that is
+    not."""
     structure = {e["id"] for e in truth["instances"] if e["structure"]}
     matched, known = {e for _, e, _ in found}, {t for t, _, _ in found}
     out = {"false_on_structure": 0, "false_on_found": 0, "false_on_missed": 0}

@@ -1,12 +1,12 @@
-"""Names from a box detector on redkitchen, held against what its pictures show.
+"""Names from a box detector on redkitchen, compared with its pictures.
 
     python benchmarks/detection.py --source PATH --detectors A.param B.param [--reconstruction rgbd sfm]
                                    [--memory FILE ...] [--json FILE]
 
 A memory is built of the whole video (or taken from `--memory`) and named by each detector, from the video and from the
-kept pictures alone. The truth are boxes in single pictures, drawn by hand: a thing is named right when the instance
-whose mask fits its box best bears its name. `others` are things of these names that are none of those, `find` asks for
-"cup on dining table". No wall may be a chair, which holds as long as structure is never named.
+kept pictures alone. The truth is hand-drawn boxes in single pictures: an object is named right when the instance with
+the best fitting mask has its name. `others` are further objects of these names, `find` asks for "cup on dining table".
+No wall may be a chair, as structure is never named.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TRUTH: dict[str, tuple[str, int, tuple[int, int, int, int]]] = {
     "chair in front": ("chair", 1, (320, 380, 588, 456)),
     "purple magazine": ("book", 300, (186, 304, 328, 410)),
 }
-"""What it is called, the number of a picture, and the box of what the depth camera sees of it there, px."""
+"""Its name, the number of a picture, and its box in the depth camera's view there, px."""
 NEAR = 2
 """Frames from that picture within which a mask counts: not every frame of colour video has masks."""
 LEAST_OVERLAP = 0.3
@@ -43,7 +43,7 @@ LEAST_OVERLAP = 0.3
 
 
 def instances_of(store: Store) -> dict[str, int | None]:
-    """The instance that each true thing is, None where the memory holds none."""
+    """The instance that each true object is, None where the memory holds none."""
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
     found: dict[str, int | None] = {}
     for name, (_, frame, box) in TRUTH.items():
@@ -64,7 +64,7 @@ def instances_of(store: Store) -> dict[str, int | None]:
 
 
 def judged(path: Path) -> dict[str, Any]:
-    """What the true things are called, and what else bears their names."""
+    """Names of the true objects, and other instances of these names."""
     with Store.open(path) as store:
         home = instances_of(store)
         objects = {i.id: i for i in store.instances.all(structure=None)}

@@ -1,13 +1,13 @@
-"""Where the learned discoverer loses against true masks: one rung of an oracle ladder for each of its steps.
+"""Losses of the learned discoverer against true masks: an oracle ladder with a rung for each step.
 
 PYTHONPATH=. python benchmarks/discovery_ladder.py --seeds 5001,5004,5008 --json FILE
 
 Each rung takes one more step from the discoverer and the rest from the truth; figures are those of `discovery.py`:
-`true` true masks, `voxels` the true thing of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true thing
-of most of their voxels, `joined` likewise of what parts make up step by step, `tree` of the clusters that agglomeration
-then passes through those that fit true things best, `cut` the clusters where it stops, those that fit a true thing,
-`bound` likewise without those that the networks take for structure, `unlisted` all of these, `listed` those that are
-sure enough: what the discoverer proposes. What tracking and merging make of it is measured by `discovery_memory.py`.
+`true` true masks, `voxels` the true object of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true
+object of most of their voxels, `joined` likewise of the joined parts, `tree` the best fitting clusters of the
+agglomeration's dendrogram, `cut` the clusters where it stops that fit a true object, `bound` likewise without those
+classified as structure, `unlisted` all of these, `listed` those above the confidence threshold: the discoverer's
+proposals. Tracking and merging are measured by `discovery_memory.py`.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from training.samples import chunk_settings, voxel_truth
 from training.worlds.film import Film, frames_of, reconstruction_of
 
 ENDS = np.arange(-4.0, 5.01, 0.5)
-"""Log odds at which the tree of agglomeration is looked at."""
+"""Log odds at which the dendrogram is sampled."""
 FITS = 0.25
-"""IoU by voxels from which a cluster fits a true thing."""
+"""IoU by voxels from which a cluster fits a true object."""
 
 SHOWN = (
     *(f"{kind}{what}_{iou}" for kind in ("", "mask_") for iou in ("0.25", "0.5") for what in ("recall", "precision")),
@@ -84,9 +84,9 @@ class Chunk:
     views: ChunkViews
     surface: ChunkSurface
     truth: NDArray[np.int32]
-    """True thing of each voxel, 0 for none. Shape (N,)."""
+    """True object of each voxel, 0 for none. Shape (N,)."""
     bound: frozenset[int]
-    """True things that are structure."""
+    """True objects that are structure."""
 
     @property
     def cloud(self) -> Cloud:
@@ -123,7 +123,7 @@ def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, 
 
 
 def proposed(discoverer: LearnedDiscoverer, chunk: Chunk, labels: Labels, flat: NDArray[np.bool_], p: int) -> Proposals:
-    """Clusters as masks on an anchor; `flat` are those that are structure."""
+    """Clusters as masks on an anchor; `flat` are structure."""
     segments = tuple(Segment(None, bool(f), 1.0) for f in flat)
     cut = Segmentation(np.asarray(labels + 1, np.int32), segments, chunk.surface.around.up)
     image = discoverer._label_view(chunk.views, p, chunk.cloud, cut)
@@ -166,7 +166,7 @@ def named(chunk: Chunk, ids: NDArray[np.int32]) -> tuple[Labels, NDArray[np.bool
 
 
 def majority(chunk: Chunk, labels: Labels) -> NDArray[np.int32]:
-    """The true thing of most voxels of each voxel's cluster, -1 where most are of none. Shape (N,)."""
+    """The true object of most voxels of each voxel's cluster, -1 where most are of none. Shape (N,)."""
     known = labels >= 0
     codes, votes = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
     order = np.lexsort((votes, codes >> 16))
@@ -178,7 +178,7 @@ def majority(chunk: Chunk, labels: Labels) -> NDArray[np.int32]:
 
 
 def best_of(chunk: Chunk, groupings: list[NDArray[np.int32]]) -> tuple[Labels, NDArray[np.bool_]]:
-    """The clusters of nested groupings that fit true things best, none in another, best first."""
+    """The clusters of nested groupings that fit true objects best, none in another, best first."""
     size = np.bincount(chunk.truth)
     found: list[tuple[float, int, int, int]] = []
     for level, labels in enumerate(groupings):

@@ -1,15 +1,14 @@
-"""What hostile files and words do to the program: lies, damages, command lines, bombs, and the list of what was found.
+"""Effects of hostile files and words on the program: lies, damages, command lines, bombs, and the list of findings.
 
     python benchmarks/hardening.py --lies 10000 --damages 1000 --command-lines 2000 --bombs \\
         --json benchmarks/results/hardening.json
 
     python benchmarks/hardening.py --list --json benchmarks/results/hardening-findings.json
 
-`--list`: what an attack on version 0.1 found, row by row, in the last checkout before it was mended and in this one.
-
+`--list`: findings of an attack on version 0.1, row by row, in the last checkout before the repair and in this one.
 `--lies`: memories of valid checksums that hold nonsense, each through all commands that read, all exports and an edit.
-None may end in a traceback, take over 10 s of a processor or 1 GB. The rest is said in `hostile/`. Two processes of the
-lowest priority; the same command goes on where it was ended.
+None may end in a traceback, take over 10 s of a processor or 1 GB. See `hostile/`. Two processes of the
+lowest priority; the same command resumes.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def write_walk(root: Path, frames: int) -> None:
 
 
 def run(source: Path, memory: Path, stop: int | None, *, resume: bool) -> list[dict[str, Any]]:
-    """Build, killed after `stop` frames; what was told at every eighth of the frames and last."""
+    """Build, killed after `stop` frames; the progress at every eighth of the frames and last."""
     command = [sys.executable, "-c", REPORT, str(source), str(memory), str(int(resume))]
     report: list[dict[str, Any]] = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

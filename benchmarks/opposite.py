@@ -1,11 +1,11 @@
-"""Rendered walks with depth that see a room again from its other end: does the whole program join the two parts?
+"""Rendered walks with depth that see a room again from its other end: does a build join the two parts?
 
 python benchmarks/opposite.py --seeds 201-204 --json FILE
 
 The end of one run and another run of `benchmarks.simulation.returns`, 320 x 240 with a sensor's noise, are one video
 with a cut. `list3r build --poses estimate` makes a memory of it: real features, real discovery, metric depth. A part is
-joined by frames where an accepted loop across the cut was found by frames that look alike, else by things. The error is
-that of the second part when the world is laid on the truth by the first.
+joined by frames where an accepted loop across the cut was found by frame similarity, else by instances. The error is
+that of the second part after alignment with the truth by the first.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def one_home(root: Path, preset: str, seed: int) -> dict[str, Any]:
 
 
 def measure(store: Store, truth: Trajectory, cut: int) -> dict[str, Any]:
-    """What joined the two parts, and how far the second lies off."""
+    """How the two parts were joined, and the error of the second."""
     chunks = {c.chunk_id: c for c in store.chunks.all()}
     across = [
         e for e in store.edges.all() if e.kind == "loop" and chunks[e.u].last_frame < cut <= chunks[e.v].first_frame

@@ -1,10 +1,10 @@
-"""How many questions scene.md answers as the memory does, by budget of tokens and size of the memory.
+"""Share of questions that scene.md answers like the memory, by budget of tokens and size of the memory.
 
     python benchmarks/prompt_pack.py [MEMORY ...] [--objects 10 100 1000 5000] [--questions 200] [--out FILE.json]
 
-A plain program reads nothing but the text. It is asked which thing is nearest to one, what holds it, how many of a name
-there are, how far two things are apart and in which direction. `general` is one text for all questions; `asked` is a
-text made for each question (of every tenth of them), whose ids it names.
+A plain program reads only the text. Questions: the nearest instance, the support, the count of a name, distance and
+direction between two instances. `general` is one text for all questions; `asked` is a text made for each question (of
+every tenth of them), whose ids it names.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def questions(memory: SceneMemory, count: int) -> Iterator[Question]:
 
 
 def made_memory(path: Path, count: int) -> None:
-    """A house of `count` things on tables in a row of rooms."""
+    """A house of `count` objects on tables in a row of rooms."""
     rng = np.random.default_rng(count)
     instances, relations, table = [], [], 0
     for n in range(1, count + 1):
@@ -110,7 +110,7 @@ def _instance(n: int, name: str, center: np.ndarray, size: np.ndarray, confidenc
 
 
 class Reader:
-    """What a plain program makes of the text; lengths in metres."""
+    """A plain program's reading of the text; lengths in metres."""
 
     def __init__(self, text: str, units: str) -> None:
         scale = 100.0 if units == "m" else 1.0
@@ -140,7 +140,7 @@ class Reader:
                     self.held[n] = int(holder[1])
 
     def answers(self, q: Question) -> bool:
-        """Whether the text says what the memory says."""
+        """Whether the text agrees with the memory."""
         if q.kind == "count":
             return (self.total or self.names).get(q.of[0]) == q.answer
         if q.kind == "held":

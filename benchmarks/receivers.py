@@ -1,12 +1,12 @@
-"""What others read in the exports of real memories: counts, ids, boxes and relations against the store, and validators.
+"""Exports of real memories as read by other libraries: counts, ids, boxes and relations against the store, and
+validators.
 
 python benchmarks/receivers.py MEMORY.l3r ... --json benchmarks/results/receivers.json
 
 Instances and relations of the store are read back from scene JSON, GraphML, node-link JSON, CSV, Parquet and USD
-(points alone, and meshes with colliders), each by a library that is not ours; corners of boxes from the transforms of
-the USD stage. Then usd-core's validators, and by `scripts/validate_usd.sh` NVIDIA's over both stages and the scene of
-props, and Robotics-Prop 4.0.0 over each prop (`--no-nvidia` leaves these out). Status 1 where anything differs or
-complains.
+(points alone, and meshes with colliders), each by another library; corners of boxes from the transforms of the USD
+stage. Then usd-core's validators, and by `scripts/validate_usd.sh` NVIDIA's over both stages and the scene of props,
+and Robotics-Prop 4.0.0 over each prop (`--no-nvidia` leaves these out). Status 1 where anything differs or complains.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Triple = tuple[int, str, int]
 
 @dataclass(frozen=True)
 class Reading:
-    """What one file says of a memory."""
+    """Content of one file about a memory."""
 
     ids: list[int]
     relations: list[Triple]
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def examined(path: Path, folder: Path, *, nvidia: bool) -> dict[str, Any]:
-    """Export a memory and hold what is read back against it."""
+    """Export a memory, read the files back and compare."""
     with list3r.open(path) as memory:
         store = stored(memory)
         metric = memory.units == "m"
@@ -97,7 +97,7 @@ def examined(path: Path, folder: Path, *, nvidia: bool) -> dict[str, Any]:
 
 
 def stored(memory: list3r.SceneMemory) -> Reading:
-    """Return what the memory says itself."""
+    """Return the content of the memory itself."""
     instances = memory.instances(structure=None)
     return Reading(
         sorted(i.id for i in instances),
@@ -107,12 +107,12 @@ def stored(memory: list3r.SceneMemory) -> Reading:
 
 
 def agrees(store: Reading, found: Reading) -> bool:
-    """Tell whether ids and relations are the same, each as often."""
+    """Return whether ids and relations are the same, each as often."""
     return found.ids == store.ids and found.relations == store.relations
 
 
 def off(store: Reading, found: Reading) -> float:
-    """Return how far corners of boxes lie from where they should, at most; infinite where a box is absent."""
+    """Return how far corners of boxes are from where they should, at most; infinite where a box is absent."""
     if not found.corners:
         return 0.0
     if set(found.corners) != set(store.corners):
@@ -198,14 +198,14 @@ READERS: dict[str, tuple[str, str, Callable[[Path], Reading]]] = {
     "usd": ("usd", "points.usdc", read_usd),
     "usd meshes": ("usd", "meshes.usdc", read_usd),
 }
-"""By name: the format, the file, and what reads it."""
+"""By name: the format, the file, and its reader."""
 
 
 # --------------------------------------------------------------------------------------------- validators
 
 
 def complaints(path: Path) -> list[str]:
-    """Return what usd-core's own validators say of a stage."""
+    """Return the findings of usd-core's own validators in a stage."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     stage = Usd.Stage.Open(str(path))
     return [e.GetMessage() for e in UsdValidation.ValidationContext(validators).Validate(stage)]

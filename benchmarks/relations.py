@@ -1,16 +1,15 @@
-"""Relations of simulated homes held against the truth, with the masks of things taken from the truth.
+"""Relations of simulated homes against the truth, with the true masks of objects.
 
 python benchmarks/relations.py --seeds 1,2,3,4 --json benchmarks/results/relations.json
 
-The pictures, depth noise, poses, tracking, merging and all rules are those of a build; only which pixels belong to
-which thing is told, so that the geometry and the rules are measured and not the discovery (`benchmarks/simulated.py`
-measures both together). Walls and ceilings do not count, and all floors are one. A thing counts when it was seen in 12
-frames and once covered 300 pixels of 320 x 240.
-What stands half on a rug is not asked where it stands; next_to_decided leaves out pairs within 3 cm of the bound (two
-deviations of a measured gap). Every claim counts, whatever its confidence. near and attached_to (to the right wall)
-are measured beside them, and what is told when it is asked for: left, right, front and behind of things near each
-other from every 30th camera, and what is between two things.
-The same memory with gravity set to unknown must make no vertical claim.
+The pictures, depth noise, poses, tracking, merging and all rules are those of a build; only the masks are given, so
+that the geometry and the rules are measured without discovery (`benchmarks/simulated.py` measures both together). Walls
+and ceilings do not count, and all floors are one. An object counts when it was seen in 12 frames and once covered 300
+pixels of 320 x 240. Objects half on a rug have no support in the truth; next_to_decided leaves out pairs within 3 cm of
+the bound (two deviations of a measured gap). Every claim counts, whatever its confidence. near and attached_to (to the
+right wall) are measured too, and the relations derived on demand: left, right, front and behind of objects near each
+other from every 30th camera, and between two objects. The same memory with gravity set to unknown must make no vertical
+claim.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ MIN_PX, MIN_FRAMES = 300, 12
 PREDICATES = ("on", "in", "next_to", "near")
 ASKED = ("viewpoint", "between")
 CLOSE_M = 0.03
-"""Pairs whose gap lies nearer to the bound of next_to than two deviations of a measured gap are close calls."""
+"""Pairs with a gap nearer to the bound of next_to than two deviations of a measured gap are undecided."""
 
 
 def main() -> None:
@@ -85,7 +84,7 @@ def main() -> None:
 
 
 def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
-    """One home: build it from told masks, and compare."""
+    """One home: build it from given masks, and compare."""
     walk, memory = root / f"walk-{seed}", root / f"memory-{seed}.l3r"
     if not (walk / "truth.json").exists():
         write_walk(walk, WalkSettings(seed=seed, write_ids=True))
@@ -131,7 +130,7 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
 
 
 def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str) -> dict[tuple[int, int], int]:
-    """Add all chunks with told masks; the true id of every local instance."""
+    """Add all chunks with given masks; the true id of every local instance."""
     settings = BuildSettings("rgbd", poses, keep_pictures=False)
     source = open_source(walk, SourceOptions())
     with store.transaction():
@@ -150,7 +149,7 @@ def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str
 
 
 class ToldMasks:
-    """A discoverer that reads the ids of the things from the truth."""
+    """A discoverer that reads the ids of the objects from the truth."""
 
     feature_space = FEATURE_SPACE
 
@@ -158,7 +157,7 @@ class ToldMasks:
         self._walk, self._truth, self._settings = walk, truth, settings
 
     def __call__(self, frames: Any, reconstruction: Any, position: int) -> Proposals:
-        """What is in view on the frame at `position`, each thing once."""
+        """True masks on the frame at `position`, each object once."""
         views = chunk_views(frames, reconstruction, self._settings)
         view = views.view(position)
         ids = _ids(self._walk, int(frames[position].index))
@@ -197,7 +196,7 @@ def _ids(walk: Path, index: int) -> np.ndarray:
 
 
 def _true_id(walk: Path, track: Any) -> int:
-    """The thing that most of a track's masks lie on."""
+    """The object that most of a track's masks are on."""
     from list3r.memory.masks import decode_mask
 
     votes: Counter[int] = Counter()
@@ -209,7 +208,7 @@ def _true_id(walk: Path, track: Any) -> int:
 
 
 def _most_common(store: Store, report: dict[tuple[int, int], int]) -> dict[int, int]:
-    """True id of every global instance; of several instances of one thing the one with most observations counts."""
+    """True id of every global instance; of several instances of one object the one with most observations counts."""
     votes: dict[int, Counter[int]] = {}
     for seen in store.observations.all():
         votes.setdefault(seen.instance_id, Counter())[report[seen.chunk_id, seen.local_id]] += 1
@@ -222,7 +221,7 @@ def _most_common(store: Store, report: dict[tuple[int, int], int]) -> dict[int, 
 
 
 def _close_calls(seed: int) -> set[tuple[int, int]]:
-    """Pairs of things of which nobody who measures to a few centimetres can say whether they are next to each other."""
+    """Pairs of objects for which next_to is undecided at an error of a few centimetres."""
     objects = [t for t in WalkSettings(seed=seed).world().objects if t.structure is None]
     close = set()
     for a in objects:
@@ -235,7 +234,7 @@ def _close_calls(seed: int) -> set[tuple[int, int]]:
 
 
 def _without(triples: list[Triple], torn: set[tuple[int, int]], truth_of: dict[int, int] | None = None) -> list[Triple]:
-    """The triples less what is not asked: on what things stand that are half on a rug, and whether they are near it."""
+    """The triples without excluded ones: support of objects half on a rug, and whether they are near it."""
     objects = {obj for obj, _ in torn}
     pairs = torn | {(rug, obj) for obj, rug in torn}
     named = [(s, o) if truth_of is None else (truth_of.get(s), truth_of.get(o)) for s, _, o in triples]
@@ -247,7 +246,7 @@ def _without(triples: list[Triple], torn: set[tuple[int, int]], truth_of: dict[i
 
 
 def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
-    """Things that stand with some feet on a rug and with some beside it, neither being the answer; with the rug."""
+    """Objects that are with some feet on a rug and with some next to it, neither being the answer; with the rug."""
     objects = WalkSettings(seed=seed).world().objects
     torn = set()
     for rug_id, rug in ((t.id, t.box()) for t in objects if t.label == "rug"):
@@ -262,7 +261,7 @@ def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
 
 
 def part_boxes(obj: SimulatedObject) -> list[OrientedBox]:
-    """The box of each part of a thing in the world."""
+    """The box of each part of an object in the world."""
     rotation, position = obj.rotation(), np.array(obj.position)
     corners = [part.extent() for part in obj.parts]
     return [OrientedBox(position + rotation @ ((low + high) / 2), high - low, rotation) for low, high in corners]

@@ -1,4 +1,4 @@
-"""Relations that are told when they are asked for, held against the truth: by viewpoint, and between two things.
+"""Relations derived on demand, against the truth: by viewpoint, and between two objects.
 
 The truth applies the definitions of `list3r/queries/viewpoint.py` to the true boxes and the true camera.
 """
@@ -21,7 +21,7 @@ from list3r.simulation.worlds.objects import SimulatedObject
 EVERY = 30
 """Frames from one asked viewpoint to the next."""
 APART_M = 1.5
-"""Things whose centres lie further apart are not asked what is between them."""
+"""Between is not asked for objects with centres further apart."""
 Counts = dict[str, int]
 
 

@@ -1,11 +1,11 @@
-"""How long `list3r serve` takes to answer a client while others of the same address are slow on purpose.
+"""Latency of `list3r serve` for a client while others of the same address are slow on purpose.
 
     PYTHONPATH=. python benchmarks/slow_clients.py --clients 200 --seconds 60 --json FILE
 
 A fifth of the slow ones each: send nothing; send a byte of their headers a second; the same after a first request that
 was answered; send a byte of a body a second; ask once a second and take no answer. The third and the fifth kind have a
-token. Whichever is cut connects anew at once. The client that is not slow asks over a new connection each time, and
-over one that it keeps as long as the service does.
+token. A closed one reconnects at once. The normal client asks over a new connection each time, and over one that it
+keeps open.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _asked(port: int, seconds: float) -> dict[str, Any]:
             began = time.monotonic()
             try:
                 status[which][str(_ask(connection))] += 1
-            except (OSError, http.client.HTTPException) as error:  # a kept one connects anew for the next request
+            except (OSError, http.client.HTTPException) as error:  # a kept one reconnects for the next request
                 status[which][type(error).__name__] += 1
                 connection.close()
             took[which].append(time.monotonic() - began)

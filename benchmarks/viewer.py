@@ -2,8 +2,8 @@
 
 PYTHONPATH=. python benchmarks/viewer.py --points 5000000 --json FILE --picture FILE
 
-The memory is made up (`exporters.py`). The page is Chromium without a screen and without a graphics card: what draws is
-its software renderer, so a frame is told in processor seconds of all its processes as well.
+The memory is synthetic (`exporters.py`). The page is Chromium without a screen and without a graphics card: its
+software renderer draws, so a frame is also given in processor seconds of all its processes.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ def main() -> None:
 
 
 def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, Any]:
-    """What the page takes to load, to turn and to search."""
+    """Time of the page to load, to turn and to search."""
     began = time.monotonic()
     page.open(viewer.address)
-    page.wait(lambda: "Click a thing, or search for one." in page.text(), 300)
+    page.wait(lambda: "Click an object, or search for one." in page.text(), 300)
     page.wait(viewer.server.get_clients, 300)
     loaded = time.monotonic() - began
     page.wait(lambda: [p for p in viewer._pages.values() if p.settled], 300)
@@ -99,7 +99,7 @@ def drawn(points: PageClouds, level: str) -> int:
 
 
 def turn(page: Browser) -> dict[str, float]:
-    """Turn the camera with the mouse; frames a second, the longest wait for one and what a frame costs."""
+    """Turn the camera with the mouse; frames a second, the longest wait for one and the cost of a frame."""
     page.run("window.drawn = []")
     used, began, step = cpu_seconds(page), time.monotonic(), 0
     page.call("Input.dispatchMouseEvent", type="mousePressed", x=400, y=400, button="left", clickCount=1)

@@ -1,14 +1,14 @@
-"""A simulated home filmed many times, other things moved, removed and added each time; with and without what later
-sessions saw again.
+"""A simulated home filmed many times, other objects moved, removed and added each time; with and without culling of
+views that later sessions repeat.
 
 python benchmarks/visits.py --seeds 1,2 --json benchmarks/results/visits.json
 
-The walks go this way and that, in one memory. A local instance that as many later sessions as the row says saw again is
-looked at no more (`RedundancySettings.sessions`; 0: all are). After each visit the things that the memory lists are
-held against the truth of that visit, by boxes, and the events that it tells of the visit against what the camera could
-be the first to see then (`known_places.py`), as in `sessions.py`. `left_out` counts local instances that are looked at
-no more, `pairs` the pairs of chunks that are; `library_s` is processor time of the library, seconds. The totals count
-the visits from `--from` on, before which nothing is left out.
+The walks alternate in direction, in one memory. A local instance seen again by as many later sessions as in the row is
+culled (`RedundancySettings.sessions`; 0: none). After each visit the listed instances are compared with the truth of
+that visit, by boxes, and its events with the changes that the camera could be the first to see then
+(`known_places.py`), as in `sessions.py`. `left_out` counts culled local instances, `pairs` the compared pairs of
+chunks; `library_s` is processor time of the library, seconds. The totals count the visits from `--from` on, before
+which nothing is left out.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.worlds.world import SimulatedWorld
 
 DONE = {"moved": 2, "removed": 1, "added": 1}
-"""What is done to the home as it first was, before each visit but the first."""
+"""Changes of the initial home, before each visit but the first."""
 
 
 @dataclass(frozen=True)
 class VisitWalk(ChangedWalk):
-    """The same rooms at another visit: what was added for it is at no other."""
+    """The same rooms at another visit: its added objects are at no other."""
 
     visit: int = 1
 
@@ -104,7 +104,7 @@ def filmed(root: Path, seed: int, visit: int) -> Path:
 
 
 def visited(memory: Path, walks: Sequence[Path], known: KnownPlaces, later: int, workers: int) -> dict[str, Any]:
-    """Add the last walk to the memory of those before, and measure what it tells then."""
+    """Add the last walk to the memory of those before, and score its answers."""
     library = ConsolidationSettings(redundancy=RedundancySettings(sessions=later))
     settings = BuildSettings(library=library, poses="estimate")
     if len(walks) == 1:

@@ -1,11 +1,11 @@
-"""What things look like to a simulated network: embeddings of instances and descriptors of whole frames.
+"""Appearance in a simulated network: embeddings of instances and descriptors of whole frames.
 
-Two things of one class of appearance (twins) share their embedding but for a small part of their own. A frame's
-descriptor sums what is seen, so that twin rooms from like viewpoints look alike and one place from another side does
-not: what the paper says of frame similarity (A.2). The defaults are set so that cosines fall where those of trained
-place recognition are said to. Measured on seed 101 of six presets (10 to 90 % of the pairs): consecutive frames 0.95
-and more; revisits that share over half of the picture 0.7 to 0.97, those that share a twentieth to a half 0.3 to 0.9;
-places that share nothing 0.0 to 0.65, but up to 0.98 in twin rooms, where most pairs of 0.85 and more are false.
+Two objects of one class of appearance (twins) share their embedding but for a small own part. A frame's descriptor sums
+its content, so that twin rooms from similar viewpoints are similar and one place from another side is not, as the paper
+reports of frame similarity (A.2). The defaults match the published cosines of trained place recognition. Measured on
+seed 101 of six presets (10 to 90 % of the pairs): consecutive frames 0.95 and more; revisits with more than half of the
+picture shared 0.7 to 0.97, with a twentieth to a half 0.3 to 0.9; places that share nothing 0.0 to 0.65, but up to 0.98
+in twin rooms, where most pairs of 0.85 and more are false.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class EmbeddingSettings:
 
     size: int = 32
     label_part: float = 0.6
-    """Part of a class of appearance that all things of its label share, of unit length."""
+    """Part of a class of appearance that all objects of its label share, of unit length."""
     own_part: float = 0.25
-    """Length of what sets a thing apart from its twins, against unit length of what they share."""
+    """Length of an object's own part, against unit length of the part shared with its twins."""
     noise: float = 0.3
     """Length of the noise of each track's feature."""
     side_part: float = 0.0
-    """Part of the appearance that depends on the side a thing is seen from, of unit length."""
+    """Part of the appearance that depends on the side an object is seen from, of unit length."""
     light_part: float = 0.0
     """Part that another light than the first one replaces, of unit length."""
 
@@ -49,25 +49,25 @@ class FrameDescriptorSettings:
 
     size: int = 64
     content: float = 0.7
-    """Length of what is seen, wherever in the picture."""
+    """Length of the content, anywhere in the picture."""
     arrangement: float = 0.62
-    """Length of what is seen where in the picture and from which side."""
+    """Length of the content by place in the picture and viewing direction."""
     common: float = 0.4
-    """Length of what all indoor pictures share."""
+    """Length of the part shared by all indoor pictures."""
     noise: float = 0.14
     """Length of the noise that lasts over frames (blur, exposure, people)."""
     noise_frame: float = 0.05
     """Length of each frame's own noise."""
     structure_weight: float = 0.5
-    """Weight of walls, floors and ceilings, which look bland, against things of the same area."""
+    """Weight of walls, floors and ceilings, which are plain, against objects of the same area."""
     side_part: float = 0.5
-    """Part of a thing's appearance in the arrangement that depends on the side it is seen from, of unit length."""
+    """Part of an object's appearance in the arrangement that depends on the side it is seen from, of unit length."""
     light_part: float = 0.0
-    """Part of what is seen that another light than the first one replaces, of unit length."""
+    """Part of the content that another light replaces, of unit length."""
 
 
 class Appearance:
-    """Embeddings of the things of a video, one for each id."""
+    """Embeddings of the objects of a video, one for each id."""
 
     def __init__(self, video: SimulatedVideo, size: int, label_part: float, own_part: float) -> None:
         labels = {t.id: t.label for t in video.world.objects} | {m.id: m.label for m in video.movers}
@@ -97,7 +97,7 @@ class Appearance:
         )
 
     def side(self, k: int, azimuth: Array) -> Array:
-        """Return what a thing shows from directions (V,), the mean over them. Shape (D,)."""
+        """Return an object's appearance, the mean over directions (V,). Shape (D,)."""
         turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
         return np.asarray(turns.mean(axis=0) @ _waves([self._seed, 39, int(self.looks[k])], self._size))
 
@@ -110,7 +110,7 @@ def track_feature(
     light: int = 0,
     azimuth: dict[int, Array] | None = None,
 ) -> Floats:
-    """Unit-length feature of a mask track that holds things in the given shares of its area. Shape (D,).
+    """Unit-length feature of a mask track that holds objects in the given shares of its area. Shape (D,).
 
     `azimuth` has the directions, radians, from which each of them was seen in the track's frames.
     """
@@ -160,7 +160,7 @@ def _arranged(
     shown: Array,
     settings: FrameDescriptorSettings,
 ) -> Array:
-    """Sum over things and parts of the picture of how they look from the side that is seen, mixed by part. (F, D)."""
+    """Sum over objects and parts of the picture of their appearance from the visible side, mixed by part. (F, D)."""
     size, part = settings.size, settings.side_part
     seeds = sorted({int(v) for v in looks.looks})
     waves = {v: _waves([video.seed, 36, v], size) for v in seeds}
@@ -174,7 +174,7 @@ def _arranged(
 
 
 def _areas(video: SimulatedVideo, top: int) -> Array:
-    """Shares of the picture that things fill in its six parts (two rows of three), softly. Shape (F, 6, top + 1)."""
+    """Shares of the picture that objects fill in its six parts (two rows of three), softly. Shape (F, 6, top + 1)."""
     count, height, width = video.ids.shape
     column = (np.arange(width) + 0.5) / width * 3 - 0.5
     row = (np.arange(height) + 0.5) / height * 2 - 0.5
@@ -189,7 +189,7 @@ def _areas(video: SimulatedVideo, top: int) -> Array:
 
 
 def azimuths(video: SimulatedVideo, top: int) -> Array:
-    """Direction from each thing to the camera in the thing's own frame, radians about its upright. (F, top + 1)."""
+    """Direction from each object to the camera in the object's own frame, radians about its upright. (F, top + 1)."""
     parts, cut = [], video.cuts[0] if video.later is not None else len(video.time_s)
     for world, rows in ((video.world, slice(0, cut)), (video.later or video.world, slice(cut, None))):
         place, yaw = np.zeros((top + 1, 2)), np.zeros(top + 1)

@@ -27,10 +27,10 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class InstanceErrorSettings:
-    """What goes wrong between things and mask tracks. Areas are of pictures of 64 x 48 pixels and scale with them."""
+    """Errors of mask tracks. Areas are of pictures of 64 x 48 pixels and scale with them."""
 
     small_px: float = 12.0
-    """A thing whose largest view has so many pixels is missed with a chance of 1/e, a larger one less."""
+    """An object with so many pixels in its largest view is missed with a chance of 1/e, a larger one less."""
     least_px: int = 5
     """Masks smaller than this are not made."""
     least_frames: int = 4
@@ -38,9 +38,9 @@ class InstanceErrorSettings:
     break_rate: float = 0.004
     """Chance at each frame that a track breaks and goes on under a new id."""
     gap_frames: int = 12
-    """A thing out of sight for longer comes back under a new id."""
+    """An object out of sight for longer comes back under a new id."""
     merge_share: float = 0.04
-    """Chance that a thing shares its track with one that it touches in the picture."""
+    """Chance that an object shares its track with one that it touches in the picture."""
     leak_rate: float = 0.01
     """Chance at each frame that a mask starts to spill over its border."""
     leak_frames: tuple[int, int] = (3, 12)
@@ -50,19 +50,19 @@ class InstanceErrorSettings:
     structure_seen: float = 0.85
     """Share of walls, floors and ceilings that get a track."""
     structure_known: float = 0.9
-    """Share of those that are known as such."""
+    """Share of pieces of structure that are known as such."""
     structure_false: float = 0.01
-    """Share of other things that are taken for structure."""
+    """Share of other objects that are taken for structure."""
     support_points: int = 300
     """Most support points of an instance."""
     masks: MaskErrorSettings = field(default_factory=MaskErrorSettings)
-    """What discovery gets wrong besides, in homes that it never saw."""
+    """Further errors of discovery in unseen homes."""
     embedding: EmbeddingSettings = field(default_factory=EmbeddingSettings)
 
 
 @dataclass(frozen=True)
 class ChunkGeometry:
-    """What the model made of a run of frames, in its own gauge."""
+    """Reconstruction of a run of frames, in its own gauge."""
 
     frames: NDArray[np.int64]
     """Shape (F,)."""
@@ -90,7 +90,7 @@ class _Track:
 
 def unseen_home_errors() -> InstanceErrorSettings:
     """Return the errors of discovery in homes that it never saw (research/discovery 0080): measured there are recall
-    0.61 to 0.84, precision 0.35 to 0.85 by masks, 0.3 merged pairs and 0.04 duplicates for each thing.
+    0.61 to 0.84, precision 0.35 to 0.85 by masks, 0.3 merged pairs and 0.04 duplicates for each object.
     """
     return InstanceErrorSettings(
         merge_share=0.2,
@@ -119,13 +119,14 @@ def simulate_library(
 
 @dataclass(frozen=True)
 class _Appearance:
-    """What things look like in a chunk."""
+    """Appearance of objects in a chunk."""
 
     appearance: Appearance
     colors: NDArray[np.uint8]
-    """Of each thing. Shape (T, 3)."""
+    """Of each object. Shape (T, 3)."""
     azimuth: NDArray[np.float64] | None
-    """Direction from each thing to the camera of each frame, radians; None where looks do not depend on it. (F, T)."""
+    """Direction from each object to the camera of each frame, radians; None where appearance does not depend on it. (F,
+    T)."""
     light: int
 
 
@@ -178,7 +179,7 @@ def _groups(
     settings: InstanceErrorSettings,
     rng: np.random.Generator,
 ) -> list[tuple[int, ...]]:
-    """Ids that share a track: mostly one, at times a thing and the one it touches most."""
+    """Ids that share a track: mostly one, at times an object and the one it touches most."""
     present = [int(k) for k in np.flatnonzero(areas.sum(axis=0)) if k > 0]
     taken: set[int] = set()
     out: list[tuple[int, ...]] = []
@@ -207,7 +208,7 @@ def _most_touched(ids: NDArray[np.int32], k: int, excluded: set[int]) -> int | N
 def _pieces(
     positions: NDArray[np.int64], settings: InstanceErrorSettings, rng: np.random.Generator
 ) -> list[NDArray[np.int64]]:
-    """Runs of one id: broken where the thing was out of sight, and now and then without cause."""
+    """Runs of one id: broken where the object was out of sight, and now and then without cause."""
     if not len(positions):
         return []
     broken = rng.random(len(positions) - 1) < settings.break_rate
@@ -309,7 +310,7 @@ def _support(
 
 
 def _colors(video: SimulatedVideo, top: int) -> NDArray[np.uint8]:
-    """Colour of each thing: that of its first part. Shape (top + 1, 3)."""
+    """Colour of each object: that of its first part. Shape (top + 1, 3)."""
     out = np.full((top + 1, 3), 128, np.uint8)
     for obj in video.world.objects:
         out[obj.id] = np.clip(obj.parts[0].material.color, 0, 255)

@@ -1,4 +1,4 @@
-"""What discovery gets wrong in homes that it never saw: things missed, split, exchanged, and scraps of walls."""
+"""Errors of discovery in unseen homes: objects missed, split, exchanged, and fragments of walls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MaskErrorSettings:
-    """Shares of things; none by default."""
+    """Shares of objects; none by default."""
 
     missed: float = 0.0
     """Missed whatever their size."""
@@ -22,12 +22,12 @@ class MaskErrorSettings:
     swapped: float = 0.0
     """Tracks that go over to something they touch."""
     scraps: float = 0.0
-    """Pieces of walls and floors taken for things, for each track of a thing."""
+    """Pieces of walls and floors taken for objects, for each track of an object."""
     scrap_radius: float = 0.12
     """Of such a piece, as a share of the spread of the chunk's points."""
 
     def any(self) -> bool:
-        """Tell whether tracks of things are changed at all."""
+        """Return whether tracks of objects are changed at all."""
         return self.split > 0 or self.swapped > 0
 
 
@@ -67,7 +67,7 @@ def scraps(
     settings: MaskErrorSettings,
     rng: np.random.Generator,
 ) -> list[tuple[NDArray[np.int64], Bools]]:
-    """Return positions (V,) and masks (V, H, W) of pieces of structure: what lies about one of its points."""
+    """Return positions (V,) and masks (V, H, W) of pieces of structure around one of its points."""
     bare = np.isin(ids, sorted(structure))
     where = np.argwhere(bare)
     if not len(where):

@@ -20,13 +20,13 @@ BEFORE = "2aa1804fb2"
 
 
 NOT_SHOWN = {
-    "2 update of a memory with a damaged reason of a merge": "an update of so small a walk writes no merge beside the "
+    "2 update of a memory with a damaged reason of a merge": "an update of so small a walk merges only the "
     "damaged one; the same signing is shown by `label`",
     "9 depth of 0.2 mm": "`inspect` of the earlier version has this note in the layouts of TUM and 7-Scenes",
     "9 depth of 5 mm, in 1/5000 m": "as for 0.2 mm",
     "11 in USD, HTML, GraphML, JSON and SQL": "of these the earlier version had USD and JSON alone, which escaped",
     "14 standard error is closed; label": "the earlier version failed where standard output was closed or full, and in "
-    "`build`; it stands here beside those",
+    "`build`; it is listed with them",
     "14 a lie with valid checksums: text where an id stands": "the earlier version refused it, or did not read it, "
     "in the commands that are tried",
     "14 a lie with valid checksums: text where a component stands": "as for an id, five exports included",

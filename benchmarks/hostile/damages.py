@@ -1,8 +1,8 @@
 """Damaged memories through all questions and edits: equal to the sound file's answer or refused, never signed anew.
 
-A damage flips bits, swaps, zeroes, tears or repeats pages, appends some or cuts some off. A question about the damaged
-file must answer as about the sound one, or be refused. An edit of a file that `verify` calls damaged must leave one
-that it still calls damaged; an edit of one that it calls sound must come to what the edit of the sound file comes to.
+A damage flips bits, swaps, zeroes, tears or repeats pages, appends some or cuts some off. A question to the damaged
+file must have the answer of the sound one, or be refused. An edit of a file that `verify` reports as damaged must leave
+it reported; an edit of one reported as sound must have the result of the same edit of the sound file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PAGE = 4096
 
 @dataclass(frozen=True)
 class _Sound:
-    """A sound memory, and what it answers."""
+    """A sound memory, and its answers."""
 
     path: Path
     data: bytes
@@ -34,7 +34,7 @@ class _Sound:
     """The file some edits earlier."""
     answers: dict[str, str]
     edited: dict[str, str]
-    """What each edit comes to, by the edit."""
+    """Result of each edit, by the edit."""
 
 
 def batch(folder: Path, first_seed: int, n: int) -> Batch:
@@ -55,7 +55,7 @@ def batch(folder: Path, first_seed: int, n: int) -> Batch:
 
 
 def damaged(data: bytes, older: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """Return a damaged copy, and what was done to it."""
+    """Return a damaged copy, and the damage."""
     kind = rng.choice(sorted(_KINDS))
     changed = bytearray(data)
     message = _KINDS[kind](changed, older, rng)
@@ -151,7 +151,7 @@ def _edit(sound: _Sound, edit: str, what: str, verdict: Outcome, tally: Tally) -
 
 
 def _answer(outcome: Outcome, path: Path) -> str:
-    """What a command printed, but for the size of the file, and wrote."""
+    """Output of a command without the size of the file, and its files."""
     written = [p.read_bytes() for p in sorted(path.parent.glob("OUT.*"))]
     return f"{[line for line in outcome.out.splitlines() if not line.startswith('size mb')]}{written}"
 
@@ -163,7 +163,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _ask(path: Path, command: str) -> Outcome:
-    """Run a command; what others wrote is gone."""
+    """Run a command in an empty folder."""
     for old in path.parent.glob("OUT.*"):
         old.unlink()
     return ask(command_on(path, command, path.parent))

@@ -1,9 +1,8 @@
-"""A phone's walk with stretches in which its pictures say little of where it is: a bare wall, a quick turn, no light.
-
-They were chosen before anything was built of them, as what every walk through a home has: someone turns to a wall and
-stands close before it, turns away quickly in lamp light, and for a moment holds a finger over the lens (or walks
-through a dark corridor). The given poses go on through all of it with their drift, as inertial odometry does; their
-jump falls to the end of the turn away from the wall, the dark comes after it.
+"""A phone's walk with stretches without visual cues: a bare wall, a quick turn, no light. They were chosen before any
+build, as typical of a walk through a home: someone turns to a wall and is close before it, turns away quickly in lamp
+light, and for a moment holds a finger over the lens (or walks through a dark corridor). The given poses go on through
+all of it with their drift, as inertial odometry does; their jump falls to the end of the turn away from the wall, the
+dark comes after it.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ WALKED, WALL, TURN, DARK, LOWERED = "walked", "wall", "turn", "dark", "lowered"
 
 @dataclass(frozen=True)
 class BlindSettings:
-    """Where the camera cannot be followed by what it sees."""
+    """Where the camera cannot be tracked visually."""
 
     wall_at: float = 0.3
     """Share of the walk after which the camera turns to the nearest bare wall and comes back."""
@@ -80,7 +79,7 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
 
 
 def exposed(T_world_cam: Array, k: int, fps: float, exposure_s: float, count: int = 7) -> list[Array]:
-    """Return the poses during the exposure in whose middle frame k was taken. Shape (4, 4) each."""
+    """Return the poses during the exposure of frame k. Shape (4, 4) each."""
     before, T, after = (T_world_cam[min(max(j, 0), len(T_world_cam) - 1)] for j in (k - 1, k, k + 1))
     shares = np.linspace(-0.5, 0.5, count) * exposure_s * fps
     return [_mixed(T, before if s < 0 else after, abs(s)) for s in shares]
@@ -105,13 +104,13 @@ def _bare_wall(walk: WalkSettings, scene: SolidScene, here: Array, blind: BlindS
         if len(seen) == 1 and seen <= walls and all(_free(scene, eye, place) for place in places):
             found.append((float(np.linalg.norm(places[0] - eye)), len(found), T))
     if not found:
-        raise ValueError(f"walk of seed {walk.seed}: no bare wall can be reached from where it is to turn aside")
+        raise ValueError(f"walk of seed {walk.seed}: no bare wall can be reached to turn aside to")
     _, _, T = min(found, key=lambda row: row[:2])
     return T[0], T[1]
 
 
 def _free(scene: SolidScene, start: Array, end: Array) -> bool:
-    """Whether nothing stands on the straight way."""
+    """Whether nothing is on the straight way."""
     low, high = scene.corners.min(axis=1) - 0.05, scene.corners.max(axis=1) + 0.05
     points = start + np.linspace(0, 1, 40)[:, None] * (end - start)
     inside = (points[:, None] > low) & (points[:, None] < high)
@@ -123,7 +122,7 @@ def _small(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _quick(start: Array, end: Array, fps: float, blind: BlindSettings) -> Array:
-    """Poses between two, of which neither is among them: it speeds up, and slows down. Shape (F, 4, 4)."""
+    """Poses between two, both excluded: it speeds up, and slows down. Shape (F, 4, 4)."""
     turn = np.degrees(abs(_turned(_angles(end)[0] - _angles(start)[0])))
     way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
     lasts_s = 1.5 * max(turn / blind.turn_deg_s, way / blind.step_m_s)

@@ -22,7 +22,7 @@ class BuildingSettings:
     """Which rooms a building has."""
 
     north: tuple[str, ...]
-    """Kinds of the rooms north of the corridor from west to east. Rooms whose kind ends in the same `#name` are twins,
+    """Kinds of the rooms north of the corridor from west to east. Rooms of a kind with the same `#name` are twins,
     equal in everything but their place."""
     south: tuple[str, ...] = ()
     """Kinds south of the corridor; these rooms are turned by 180 degrees."""
@@ -44,7 +44,7 @@ class BuildingSettings:
 
 @dataclass(frozen=True)
 class PlacedRoom:
-    """A room where it stands."""
+    """A room where it is."""
 
     kind: str
     twin: str
@@ -151,7 +151,7 @@ def _place(
     corridor_width: float | None,
     south: bool,
 ) -> PlacedRoom:
-    """Add a room's things to the building: north of the corridor, south of it and turned, or as the corridor."""
+    """Add a room's objects to the building: north of the corridor, south of it and turned, or as the corridor."""
     if corridor_width is None:
         origin, turn = (0.0, 0.0), 0.0
     elif south:
@@ -171,6 +171,6 @@ def _place(
 
 
 def appearance_classes(objects: tuple[SimulatedObject, ...]) -> dict[int, int]:
-    """Class of appearance of each thing, from its label and parts: copies share one, wherever they stand."""
+    """Class of appearance of each object, from its label and parts: copies share one, wherever they are."""
     classes: dict[object, int] = {}
     return {t.id: classes.setdefault((t.label, t.parts), len(classes)) for t in objects}

@@ -16,11 +16,11 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 _FIRST = 24
-"""Solids of a frame's first sweep, the nearest large ones, whose depth spares the second sweep what they hide."""
+"""Solids of a frame's first sweep, the nearest large ones, which occlude others in the second sweep."""
 
 
 class Caster:
-    """Casts depth and ids for one camera; things that move are put in their places through `scene`."""
+    """Casts depth and ids for one camera; objects that move are put in their places through `scene`."""
 
     def __init__(
         self, fixed: Sequence[SimulatedObject], camera: Camera, moving: Sequence[SimulatedObject] = ()

@@ -1,4 +1,4 @@
-"""What happens to a world between two walks: things are moved, taken away, put in."""
+"""Changes of a world between two walks: objects are moved, removed and added."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _TOPS = ("table", "desk", "side table", "cabinet")
 
 @dataclass(frozen=True)
 class Change:
-    """One change. Things keep their ids; an added one gets an id that the world never had."""
+    """One change. Objects keep their ids; an added one gets an id that the world never had."""
 
     kind: str
     """moved, removed or added."""
     obj: int | None = None
-    """Id of the thing that is moved or removed."""
+    """Id of the object that is moved or removed."""
     target: int | None = None
     """Id of the table or the like that it is moved to or added on."""
     label: str = "mug"
-    """What is added."""
+    """Kind of an added object."""
     seed: int = 0
-    """Decides the place and the look of what is added."""
+    """Seed of the place and appearance of an added object."""
 
     def __post_init__(self) -> None:
         if self.kind not in ("moved", "removed", "added"):
@@ -40,13 +40,13 @@ class Change:
 def random_changes(
     world: SimulatedWorld, seed: int, moved: int = 2, removed: int = 1, added: int = 1
 ) -> tuple[Change, ...]:
-    """Changes to small things on tables, drawn from a seed; no thing is changed twice."""
+    """Changes to small objects on tables, drawn from a seed; no object is changed twice."""
     rng = np.random.default_rng([seed, 5])
     tops = [t.id for t in world.objects if t.label in _TOPS]
     filled = {t.container for t in world.objects if t.container is not None}
     small = [t for t in world.objects if t.support in tops and t.label in SMALL_KINDS and t.id not in filled]
     if moved + removed > len(small):
-        raise OptionError(f"{moved + removed} changes asked for, but only {len(small)} small things stand on tables")
+        raise OptionError(f"{moved + removed} changes asked for, but only {len(small)} small objects are on tables")
     chosen = [small[k] for k in rng.permutation(len(small))[: moved + removed]]
     numbers = iter(int(n) for n in rng.integers(1 << 30, size=moved + added))
     changes = [Change("removed", obj.id) for obj in chosen[moved:]]
@@ -85,7 +85,7 @@ def _changed(world: SimulatedWorld, change: Change) -> tuple[SimulatedObject, ..
     known = {t.id: t for t in world.objects}
     for object_id in (change.obj, change.target):
         if object_id is not None and object_id not in known:
-            raise OptionError(f"no thing {object_id} in the world: its ids go from 1 to {max(known)}")
+            raise OptionError(f"no object {object_id} in the world: its ids go from 1 to {max(known)}")
     if change.kind == "added":
         parts, _ = Placer(np.random.default_rng([change.seed, 6])).small(change.label)
         new = SimulatedObject(max(known) + 1, change.label, parts, (0.0, 0.0, 0.0))
@@ -110,7 +110,7 @@ def _asked(object_id: int | None, name: str) -> int:
 
 
 def _put(world: SimulatedWorld, obj: SimulatedObject, target: SimulatedObject, seed: int) -> SimulatedObject:
-    """The thing at a free place on top of the target."""
+    """The object at a free place on top of the target."""
     rng = np.random.default_rng([seed, 7])
     box = target.box()
     top = float(box.center[2] + box.size[2] / 2)

@@ -1,4 +1,4 @@
-"""Puts groups of things into a room: along its walls or in the open, never in a doorway."""
+"""Puts groups of objects into a room: along its walls or in the open, never in a doorway."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Door:
 
 @dataclass(frozen=True)
 class RoomPlan:
-    """What a room is to be."""
+    """Specification of a room."""
 
     kind: str
     """A key of `rooms.KINDS`."""
@@ -44,7 +44,7 @@ class RoomPlan:
     depth: float
     doors: tuple[Door, ...]
     clutter: float = 1.0
-    """Share of the small things that are put in."""
+    """Share of the small objects that are put in."""
     windows: int = 1
 
 
@@ -61,7 +61,7 @@ def door_middle(plan: RoomPlan, door: Door) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a building has bought many of: these things look alike wherever they stand."""
+    """Models that a building has many of: these objects have one appearance everywhere."""
 
     chair: f.Parts
     office_chair: f.Parts
@@ -102,7 +102,7 @@ def _office_chair(metal: Material, cloth: Material) -> f.Parts:
 
 @dataclass
 class Furnisher:
-    """Puts groups of things into one room: along its walls or in the open, never in a doorway."""
+    """Puts groups of objects into one room: along its walls or in the open, never in a doorway."""
 
     p: Placer
     plan: RoomPlan
@@ -148,7 +148,7 @@ class Furnisher:
         return False
 
     def on_wall(self, label: str, parts: f.Parts, width: float, z: float, sides: tuple[str, ...] = SIDES) -> None:
-        """Hang something on a wall beside the doors."""
+        """Hang something on a wall next to the doors."""
         for _ in range(20):
             side = sides[self.p.rng.integers(len(sides))]
             long = self.plan.width if side in ("south", "north") else self.plan.depth
@@ -169,7 +169,7 @@ class Furnisher:
         self._hung: list[tuple[str, float, float]] = []
 
     def against(self, side: str, at: float, gap: float) -> tuple[float, float, float]:
-        """Place and yaw (degrees) of what has its back to a wall."""
+        """Place and yaw (degrees) of an object with its back to a wall."""
         w, d = self.plan.width, self.plan.depth
         return {
             "south": (at, gap, 0.0),
@@ -192,7 +192,7 @@ class Furnisher:
 
 
 def moved(obj: SimulatedObject, x: float, y: float, yaw: float, id_offset: int = 0) -> SimulatedObject:
-    """The thing after a turn about the origin and a shift; its id and those it names rise by `id_offset`."""
+    """The object after a turn about the origin and a shift; its id and the ids it refers to rise by `id_offset`."""
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     px, py, pz = obj.position
     at = (x + c * px - s * py, y + s * px + c * py, pz)

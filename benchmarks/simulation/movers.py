@@ -1,4 +1,4 @@
-"""What moves while it is filmed: a person who walks about before the camera, and a thing that is carried away."""
+"""Moving objects: a person who walks before the camera, and an object that is carried away."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def _viterbi(free: FreeMap, places: Array, cost: Array, seconds: Array) -> Array
 
 
 def _carried(free: FreeMap, T_world_cam: Array, xy: Array, yaw: Array, fps: float, rng: np.random.Generator) -> Array:
-    """A carton that stands on the floor, is lifted by the person before the camera, carried, and set down elsewhere."""
+    """A carton that is on the floor, is lifted by the person before the camera, carried, and set down elsewhere."""
     frames = len(xy)
     held = xy + np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * 0.34
     lifts = np.arange(int(0.25 * frames), int(0.6 * frames), 10)

@@ -1,4 +1,4 @@
-"""Videos by name: what kind of building, which way through it, what moves."""
+"""Videos by name: kind of building, way through it, movers."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Array = NDArray[np.float64]
 _FURNISHED = ("living room", "bedroom", "office", "kitchen", "meeting room", "storage")
 _FPS = 12.5
 _BEFORE_CUT = (1, 10, 20)
-"""Frames before a cut whose views must share nothing with the view after it."""
+"""Frames before a cut that must share nothing with the view after it."""
 
 
 _SOMETIMES_FAST = ("loop", "kidnap", "twins")
-"""Presets of which every third seed has a camera that turns nearly twice as fast."""
+"""Presets with a camera that turns nearly twice as fast in every third seed."""
 
 
 def preset_names() -> tuple[str, ...]:
@@ -248,7 +248,7 @@ def _jump(take: Take) -> Director:
 
 
 class _Glimpse:
-    """Small pictures of a building, to tell which views overlap."""
+    """Small pictures of a building, to find overlapping views."""
 
     def __init__(self, take: Take) -> None:
         self._camera = preset_camera((32, 24))
@@ -264,7 +264,8 @@ class _Glimpse:
 
 
 def _near_view(take: Take, director: Director, poses: Array, frame: int) -> View | None:
-    """What was looked at from some frame on, from another place in that room; None in corridors and doorways."""
+    """A view of the same target as from some frame on, from another place in that room; None in corridors and
+    doorways."""
     room = take.building.room_at(*poses[frame, :2, 3])
     if room is None or room.kind == "corridor":
         return None
@@ -363,7 +364,7 @@ _PRESETS: dict[str, _Preset] = {
 
 
 def _looking_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Return T_world_cam of an upright camera at `eye` that looks at `target`, metres. Shape (4, 4)."""
+    """Return T_world_cam of an upright camera at `eye` towards `target`, metres. Shape (4, 4)."""
     x, y, z = np.array(target) - np.array(eye)
     angles = [np.array([a]) for a in (np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), 0.0)]
     return np.asarray(viewing_poses(np.array([eye]), *angles)[0])

@@ -1,14 +1,14 @@
-"""Videos in which a place is seen again, but not as before: where the likeness of pictures fails.
+"""Videos that return to a place of changed appearance, where frame similarity fails.
 
 Each has two runs with a cut between them. The first ends in some room, the second begins there:
 
-- opposite: from the other end of the room, looking the other way; the camera stands where it looked to before;
-- night: the same views in another light, which changes what things and pictures look like;
-- alike: in one of three rooms of one plan, which differ by the looks of three things each, and by where they stand;
-- moved: half of the furniture and of the small things moved in between, and the light changed;
-- halls: large bare halls with two or three things each;
+- opposite: from the other end of the room in the opposite direction;
+- night: the same views in another light, which changes the appearance of objects and pictures;
+- alike: in one of three rooms of one plan, which differ in appearance and place of three objects each;
+- moved: half of the furniture and of the small objects were moved in between, and the light changed;
+- halls: large bare halls with two or three objects each;
 - seasons: a kitchen in another light, by another camera of another field of view, held at another height, after half of
-  the small things were moved.
+  the small objects were moved.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ Array = NDArray[np.float64]
 RETURNS = ("opposite", "night", "alike", "moved", "halls", "seasons")
 _KINDS = ("living room", "bedroom", "office", "kitchen", "meeting room", "storage")
 _STAYS = ("door", "door frame", "window", "picture", "whiteboard", "sink", "worktop", "wardrobe", "bookshelf")
-"""What is not moved about."""
+"""Kinds that are not moved."""
 _LIT = ("night", "moved", "seasons")
-"""Presets of which the second run has another light."""
+"""Presets with another light in the second run."""
 
 
 def make_return(preset: str, seed: int, size: tuple[int, int] = (64, 48)) -> SimulatedVideo:
@@ -57,7 +57,7 @@ def make_return(preset: str, seed: int, size: tuple[int, int] = (64, 48)) -> Sim
 
 
 def film_return(preset: str, seed: int) -> tuple[Take, SimulatedWorld | None]:
-    """Return the building and both runs of a preset, and the world of the second run where things were moved."""
+    """Return the building and both runs of a preset, and the world of the second run where objects were moved."""
     if preset not in RETURNS:
         raise OptionError(f"no preset {preset!r}: one of {', '.join(RETURNS)}")
     rng = np.random.default_rng([seed, 51, RETURNS.index(preset)])
@@ -89,7 +89,7 @@ def _building(preset: str, seed: int, rng: np.random.Generator) -> Building:
 
 
 def _distinct(world: SimulatedWorld, rooms: tuple[PlacedRoom, ...], rng: np.random.Generator) -> SimulatedWorld:
-    """Return the world with three things of each room in colours of their own."""
+    """Return the world with three objects of each room in colours of their own."""
     objects = {t.id: t for t in world.objects}
     for room in rooms:
         loose = [k for k in room.objects if objects[k].structure is None]
@@ -155,7 +155,7 @@ def _near(director: Director, room: PlacedRoom, view: View) -> View:
 
 
 def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generator, floor: bool) -> SimulatedWorld:
-    """Return the world with half of what stands on furniture, and on the `floor`, of a room put elsewhere in it."""
+    """Return the world with half of the objects on a room's furniture and `floor` moved within it."""
     objects = {t.id: t for t in world.objects}
     floors = [k for k in room.objects if objects[k].structure == "floor"]
     for k in room.objects:
@@ -179,7 +179,7 @@ def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generato
 def _elsewhere(
     obj: SimulatedObject, objects: dict[int, SimulatedObject], room: PlacedRoom, floor: bool, rng: np.random.Generator
 ) -> SimulatedObject | None:
-    """Return the thing at a free place of the room's floor or of what it stands on, None where there is none."""
+    """Return the object at a free place of the room's floor or of its support, None where there is none."""
     base = None if floor or obj.support is None else objects[obj.support].box()
     rivals = [
         t.box()
@@ -203,7 +203,7 @@ def _elsewhere(
 
 
 def _with(obj: SimulatedObject, before: SimulatedObject, after: SimulatedObject) -> SimulatedObject:
-    """Return a thing that is carried by one that was put elsewhere."""
+    """Return an object moved with its support."""
     turn = after.yaw - before.yaw
     c, s = float(np.cos(turn)), float(np.sin(turn))
     dx, dy = obj.position[0] - before.position[0], obj.position[1] - before.position[1]

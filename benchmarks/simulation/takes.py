@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shot:
-    """A video without pictures: where the camera is in every frame and what stands and moves there."""
+    """A video without pictures: the camera's poses, the building and the movers."""
 
     preset: str
     seed: int

@@ -33,9 +33,8 @@ class ChangedWalk(WalkSettings):
 
 @dataclass(frozen=True)
 class PresetWalk(WalkSettings):
-    """A building, a way through it and what moves there, by name (see `presets`).
-
-    `seed` decides them; `path` and `walk_seed` are left aside, and the walk is never slowed.
+    """A building, a way through it and its movers, by name (see `presets`). `seed` decides them; `path` and `walk_seed`
+    are unused, and the walk is never slowed.
     """
 
     preset: str = "calm"
@@ -49,7 +48,7 @@ class PresetWalk(WalkSettings):
         return self._shot().time_s[self._span()], self._shot().T_world_cam[self._span()]
 
     def movers(self) -> tuple[MovingObject, ...]:
-        """What moves while it is filmed, with its pose in each of the frames to be written."""
+        """The moving objects, with their poses in the frames to be written."""
         return tuple(replace(m, T_world_object=m.T_world_object[self._span()]) for m in self._shot().movers)
 
     def cuts(self) -> tuple[int, ...]:
@@ -75,8 +74,7 @@ class PresetWalk(WalkSettings):
 @dataclass(frozen=True)
 class SeenAgainWalk(WalkSettings):
     """The end of the first run and the whole second run of `benchmarks.simulation.returns`, where nothing was moved.
-
-    `seed` decides both; `path` and `walk_seed` are left aside.
+    `seed` decides both; `path` and `walk_seed` are unused.
     """
 
     preset: str = "opposite"
@@ -100,9 +98,8 @@ class SeenAgainWalk(WalkSettings):
 
 @dataclass(frozen=True)
 class HomeSessionWalk(WalkSettings):
-    """One of two sessions in a room of a home, between which half of what can be moved was (`moved` of `returns`).
-
-    `seed` decides the home and both ways; `path` and `walk_seed` are left aside.
+    """One of two sessions in a room of a home; half of its movable objects are moved in between (`moved` of `returns`).
+    `seed` decides the home and both ways; `path` and `walk_seed` are unused.
     """
 
     second: bool = False
@@ -133,7 +130,7 @@ def _shot(preset: str, seed: int) -> Shot:
 
 
 def _mover_truth(obj: SimulatedObject, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
-    """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
+    """Entry of a moving object in `truth.json`: its size and, for each frame, the middle of its base and its yaw.
 
     `obj` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
     """

@@ -1,4 +1,4 @@
-"""A batch: the tasks that are not done are handed to an engine, and what becomes of them is written down."""
+"""A batch: unfinished tasks are handed to an engine, and their outcomes are recorded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.records import JsonFields
 
 STATE = "batch.sqlite"
-"""Name of the manifest beside the memories."""
+"""Name of the manifest next to the memories."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class BatchSettings:
     out: str
     """Folder or URL of the memories."""
     scratch: Path | None = None
-    """Folder on each machine's own disk for what is under way; None: `.work` in a local `out`, else in the system's
+    """Folder on each machine's own disk for unfinished files; None: `.work` in a local `out`, else in the system's
     folder for temporary files."""
     state: Path | None = None
     """The manifest; None: in a local `out`."""
     retries: int = 3
-    """How often a task is tried again whose process was ended from outside."""
+    """Retries of a task whose process was ended from outside."""
     workers: int = 0
-    """Processes of a task beside the one that runs it."""
+    """Processes of a task besides the one that runs it."""
     onto: bool = False
     force: bool = False
 
@@ -74,7 +74,7 @@ class BatchSettings:
 
 @dataclass(frozen=True)
 class BatchReport(JsonFields):
-    """What a run of a batch did."""
+    """Result of a run of a batch."""
 
     done: int
     """Tasks that are done now."""
@@ -85,7 +85,7 @@ class BatchReport(JsonFields):
 
 
 OnOutcome = Callable[[Outcome, int, int], None]
-"""Called with how an attempt ended, the tasks that are settled, and all."""
+"""Called with the outcome of an attempt, the number of finished tasks, and of all."""
 
 
 def run_batch(
@@ -97,7 +97,7 @@ def run_batch(
     """Do the tasks that are not done yet; tasks of one memory one after the other, others side by side.
 
     A task that fails leaves the others alone. When the batch is interrupted its tasks end at once and are pending; the
-    same call goes on with them. Raises `OptionError` and `MemoryFileError` for what concerns all tasks.
+    same call goes on with them. Raises `OptionError` and `MemoryFileError` for errors that concern all tasks.
     """
     try:
         Output(settings.out).prepare()

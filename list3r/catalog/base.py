@@ -1,4 +1,4 @@
-"""What a database of a catalogue does, and which one a URL means."""
+"""Interface of a catalogue's database, and the database of a URL."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ class Backend(Protocol):
     """A database that holds a catalogue. Each call sees one state of it. Raises `CatalogError`."""
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name; of the same file only when it is asked for `again`.
-
-        Return its entry, whose revision is the next one where the file is another.
+        """Write a memory in place of the one with its name; the same file only with `again`. Return its entry, with the
+        next revision where the file differs.
         """
         ...
 
@@ -34,7 +33,7 @@ class Backend(Protocol):
         ...
 
     def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
-        """Return entries by name, all or those of some names."""
+        """Return entries by name, all or some."""
         ...
 
     def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
@@ -83,7 +82,7 @@ class Backend(Protocol):
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogInstance, float]]:
-        """Return the k whose vectors are most like one of length 1, with the cosine, the most alike first."""
+        """Return the k instances with the highest cosine to a unit vector, the most similar first."""
         ...
 
     def alive(self) -> bool:
@@ -100,9 +99,9 @@ def wanted_sql(
 ) -> tuple[str, list[Any]]:
     """Return the condition (with `?` for values) that an instance is wanted, and its values.
 
-    `words` makes the condition of having words, of an alias and the words. Relations are looked up for each that has
-    the words: OFFSET keeps PostgreSQL from joining them instead, which takes minutes in one memory where it has no
-    statistics yet. Over all memories joining them is many times faster, from the end that fewer have: `joined`.
+    `words` makes the condition of having words, of an alias and the words. Relations are looked up for each instance
+    with the words: OFFSET keeps PostgreSQL from a join, which takes minutes in one memory without statistics. Over all
+    memories a join from the rarer end is many times faster: `joined`.
     """
     parts, values = ["TRUE"], []
     if wanted.words:

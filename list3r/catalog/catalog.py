@@ -79,10 +79,11 @@ class Catalog:
     # ------------------------------------------------------------------ memories
 
     def add(self, path: str | Path, name: str | None = None, store: str | None = None) -> MemoryEntry:
-        """Take a memory file into the catalogue, in place of what has its name; its entry, with the new revision.
+        """Add a memory file to the catalogue, in place of the one with its name; returns its entry, with the new
+        revision.
 
         With a `store`, a folder or URL, the file is copied there under a name that no other file ever gets, and the
-        catalogue names the copy. Raises `OptionError` for what cannot be a name, `CatalogError`, `MemoryFileError`.
+        catalogue names the copy. Raises `OptionError` for an invalid name, `CatalogError`, `MemoryFileError`.
         """
         content = read_content(str(path), name)
         if store is not None:
@@ -135,7 +136,7 @@ class Catalog:
         k: int = 5,
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
-        """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
+        """Find the k instances of one memory nearest to a point or to the centre of an instance, by their boxes."""
         k, filters = _count(k), filters or CatalogFilters()
         if (point is None) == (instance_id is None):
             raise OptionError("give either a point or an instance")
@@ -144,7 +145,7 @@ class Catalog:
         while True:
             entry, near = _of(memory, self._backend.near(printable(memory), at.tolist(), count, filters))
             found = [f for f in _by_distance(near, at) if f[1] != own][:k]
-            # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
+            # Axis-aligned boxes bound the distance from below: other instances are no nearer than the last.
             if len(near) < count or (len(found) == k and found[-1][0] <= near[-1].aabb_distance(at)):
                 break
             count *= 4
@@ -161,7 +162,7 @@ class Catalog:
         radius: float | None = None,
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
-        """Find the things of one memory whose boxes meet a box or a sphere, those nearest to its middle first."""
+        """Find the instances of one memory whose boxes meet a box or a sphere, those nearest to its middle first."""
         filters = filters or CatalogFilters()
         box, sphere = lower is not None and upper is not None, center is not None and radius is not None
         if box == sphere:
@@ -171,7 +172,7 @@ class Catalog:
             low, high = checked_point(lower, "lower corner"), checked_point(upper, "upper corner")
             middle, reach = (low + high) / 2.0, np.inf
             if (low > high).any():
-                raise OptionError(f"the lower corner {low.tolist()} must not lie beyond the upper one {high.tolist()}")
+                raise OptionError(f"the lower corner {low.tolist()} must not be beyond the upper one {high.tolist()}")
         else:
             assert center is not None and radius is not None
             middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
@@ -179,7 +180,7 @@ class Catalog:
         region = low.tolist(), high.tolist()
         entry, met = _of(memory, self._backend.inside(printable(memory), *region, filters, MOST_ANSWERS + 1))
         found = _by_distance(met, middle)
-        notes = [f"more than {MOST_ANSWERS} things are there; only these are listed"] if len(met) > MOST_ANSWERS else []
+        notes = [f"only the first {MOST_ANSWERS} instances are listed"] if len(met) > MOST_ANSWERS else []
         rows = (
             (t, 1.0 / (1.0 + d), d, f"box {d:.2f} from the middle") for d, _, t in found[:MOST_ANSWERS] if d <= reach
         )
@@ -188,17 +189,16 @@ class Catalog:
     def find(
         self, text: str, memory: str | None = None, *, k: int = 5, filters: CatalogFilters | None = None
     ) -> CatalogAnswers:
-        """Find things by a phrase, in one memory or over all: words, and stored relations to what other words name.
-
-        Sizes, superlatives and what depends on a viewpoint are questions to one file. Raises `OptionError`.
+        """Find instances by a phrase, in one memory or over all: words, and stored relations to instances of other
+        words. Sizes, superlatives and relations of a viewpoint are questions to one file. Raises `OptionError`.
         """
         k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
         wanted = _wanted(parse(text))
         if not STRUCTURE.isdisjoint(wanted.words):
             filters = CatalogFilters(True, filters.min_confidence, filters.state)
         found, ranked = self._backend.named(memory, wanted, k, filters)
-        notes = [f"{ranked} or more things match {text!r}; only {ranked} were ranked"] if ranked >= MOST_RANKED else []
-        wording = f"named {' '.join(wanted.words)}" if wanted.words else "stands so"
+        notes = [f"{text!r}: only {ranked} of the matching instances were ranked"] if ranked >= MOST_RANKED else []
+        wording = f"named {' '.join(wanted.words)}" if wanted.words else "matching"
         return self._answers(((t, score, None, wording) for t, score in found), entries, notes)
 
     def similar(
@@ -212,7 +212,7 @@ class Catalog:
         k: int = 5,
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
-        """Find things that look like an instance of a memory, or like a vector of a space: over all memories, or in
+        """Find instances that look like an instance of a memory, or like a vector of a space: over all memories, or in
         that one alone where not `anywhere`.
 
         Raises `OptionError` for arguments that make no sense, `SpaceMismatchError` for vectors of another space.
@@ -283,7 +283,7 @@ class Catalog:
         return found
 
     def _end(self, what: int | str | None, memory: str | None) -> Wanted:
-        """Return what a subject or an object stands for."""
+        """Return the memory and instance or words of a subject or an object."""
         if what is None:
             return Wanted()
         if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):
@@ -338,7 +338,7 @@ class Catalog:
 def _of(
     name: str, found: tuple[MemoryEntry, list[CatalogInstance]] | None
 ) -> tuple[MemoryEntry, list[CatalogInstance]]:
-    """Return what a database found in a memory. Raises `UnknownMemoryError` where there is none of that name."""
+    """Return the result of a database for a memory. Raises `UnknownMemoryError` where it has none of that name."""
     if found is None:
         raise _unknown(name)
     return found
@@ -349,7 +349,7 @@ def _unknown(name: str) -> UnknownMemoryError:
 
 
 def is_stale(entry: MemoryEntry) -> bool | None:
-    """Tell whether a file is another one than the catalogue knows; None for one that does not lie on this machine."""
+    """Return whether a file differs from the catalogued one; None for one that is not on this machine."""
     if is_remote(entry.path) or not entry.mtime_ns:
         return None
     try:
@@ -370,7 +370,7 @@ def box_distances(instances: Sequence[CatalogInstance], point: NDArray[np.float6
 def _by_distance(
     instances: Sequence[CatalogInstance], point: NDArray[np.float64]
 ) -> list[tuple[float, int, CatalogInstance]]:
-    """Return things with the distance of a point from their boxes and their number, the nearest first."""
+    """Return instances with the distance of a point from their boxes and their number, the nearest first."""
     held = zip(box_distances(instances, point).tolist(), instances, strict=True)
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
 
@@ -401,7 +401,7 @@ def _rounded(numbers: Iterable[float]) -> list[float]:
 
 
 def _wanted(phrase: Phrase) -> Wanted:
-    """Return a phrase as what the database can look for. Raises `OptionError` for what only a file can tell."""
+    """Return a phrase as a query of the database. Raises `OptionError` for questions that only a file can answer."""
     for what, beyond in (
         (phrase.size, phrase.size is not None),
         (phrase.superlative, phrase.superlative is not None),

@@ -34,9 +34,9 @@ _ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)
 _OF_ONE = "i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _INSTANCE = f"m.name, {_OF_ONE}"
 _BUILD_MEMORY = "2GB"
-"""What the server may take while it makes an index of vectors."""
+"""Memory of the server while it makes an index of vectors."""
 _MOST_ALIKE = 10_000
-"""Vectors that are looked at because few of the most alike pass the filters."""
+"""Vectors scanned at most when few of the most similar pass the filters."""
 _WIDE, _LISTS_OF_WIDE = 128, 20
 """Vectors with more numbers than the first are searched in as many lists as the second says, instead of 40: they take
 longer to compare, and fewer lists find as many. research/storage 0141."""
@@ -59,7 +59,7 @@ class PostgresBackend:
     # ------------------------------------------------------------------ writing
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name, in one transaction."""
+        """Write a memory in place of the one with its name, in one transaction."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
             names, marks = ", ".join(f.name for f in _ENTRY_FIELDS), ", ".join("%s" for _ in _ENTRY_FIELDS)
@@ -171,11 +171,10 @@ class PostgresBackend:
     def _placed(
         self, memory: str, which: str, values: Sequence[Any]
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and those of its instances that a condition tells, by one way to the server.
-
-        With the known number of the memory the plan reads one partition; if it is gone, it is looked up again. It is
-        passed with the type of the column: psycopg sends small numbers as `smallint`, which the index of (memory, box)
-        does not compare, so that it would be gone through over all memories of the partition.
+        """Return a memory and its instances that meet a condition, in one round trip. With the known number of the
+        memory the plan reads one partition; if it is gone, it is looked up again. It is passed with the type of the
+        column: psycopg sends small numbers as `smallint`, for which the index of (memory, box) is scanned over all
+        memories of the partition.
         """
         chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ?::integer AND {which}) i"
         query = f"SELECT {_ENTRY}, i.* FROM memory m LEFT JOIN {chosen} ON TRUE WHERE m.memory_id = ?"
@@ -258,10 +257,8 @@ class PostgresBackend:
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogInstance, float]]:
-        """Return the k most alike: in one memory exactly, over all through the index of vectors.
-
-        Of vectors that are equally alike those of the first names and ids come, so that an answer does not depend on
-        the order in which memories were written.
+        """Return the k most similar: exact in one memory, over all through the index of vectors. Ties are ordered by
+        name and id, so that an answer does not depend on the order in which memories were written.
         """
         asked, count = _halfvec(vector), k
         only, apart = "", "v <=> ?::halfvec"
@@ -282,7 +279,7 @@ class PostgresBackend:
             count = min(4 * count, _MOST_ALIKE)
 
     def _passing(self, ids: Sequence[Any], filters: CatalogFilters) -> dict[tuple[int, int], CatalogInstance]:
-        """Return those of some instances that pass the filters, by memory and id."""
+        """Return the given instances that pass the filters, by memory and id."""
         passing, values = filters_sql(filters, "i")
         query = (
             f"SELECT {_INSTANCE}, i.memory_id FROM unnest(?::integer[], ?::bigint[]) a (memory_id, id) "
@@ -351,7 +348,7 @@ class PostgresBackend:
 
 
 def _lost(error: psycopg.Error) -> bool:
-    """Whether the connection was lost, so that nobody knows whether a transaction that was ending has ended."""
+    """Whether the connection was lost, so that the end of a running transaction is unknown."""
     return isinstance(error, psycopg.OperationalError) and (error.sqlstate or "08").startswith(("57P", "08"))
 
 
@@ -372,7 +369,7 @@ def _checked(url: str) -> str:
 
 
 def _first_line(error: Exception) -> str:
-    """Return in one line what the server or the library says."""
+    """Return the message of the server or the library in one line."""
     text = getattr(getattr(error, "diag", None), "message_primary", None) or str(error).strip() or type(error).__name__
     return str(text).splitlines()[0]
 
@@ -474,7 +471,7 @@ def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
 
 
 def _marked(query: str) -> bytes:
-    """Return a query with the marks of values that this database takes. What is given never stands in its text."""
+    """Return a query with this database's placeholders. Values are never part of its text."""
     return query.replace("?", "%s").encode()
 
 

@@ -1,4 +1,4 @@
-"""Read what a catalogue takes from a memory file."""
+"""Read a memory file for a catalogue."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from list3r.memory.store.store import Store
 def read_content(path: str, name: str | None = None) -> MemoryContent:
     """Return the content of a memory file, under its own name unless another is given.
 
-    Raises `OptionError` for what cannot be a name, `MemoryFileError` for what is no memory, `CatalogError` for one that
-    is being written.
+    Raises `OptionError` for an invalid name, `MemoryFileError` for no memory, `CatalogError` for one that is being
+    written.
     """
     if path != printable(path):
         raise CatalogError(f"{printable(path)} is not valid UTF-8, which a catalogue needs; rename the file or folder")
@@ -85,5 +85,5 @@ def _instance(memory: str, i: Instance) -> CatalogInstance:
 
 
 def printable(text: str) -> str:
-    """Return a text without what a database cannot hold: NUL, and halves of characters."""
+    """Return a text without characters that a database cannot hold: NUL and lone surrogates."""
     return text.replace("\x00", "\ufffd").encode("utf-8", "replace").decode("utf-8")

@@ -57,7 +57,7 @@ _FROM = "FROM instance i JOIN memory m ON m.memory_id = i.memory_id"
 _OF_MEMORY = "i.memory_id = (SELECT memory_id FROM memory WHERE name = ?)"
 _BATCH = 20_000
 _GROW = 2.0
-"""How much further is looked where too little lies within a distance."""
+"""Factor by which a search distance grows when it finds too few."""
 
 
 class SqliteBackend:
@@ -84,7 +84,7 @@ class SqliteBackend:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name."""
+        """Write a memory in place of the one with its name."""
         with self._writing():
             known = self.memories([content.entry.name])
             before = known[0] if known else content.entry
@@ -169,7 +169,7 @@ class SqliteBackend:
         return (entry[0], self._near(memory, np.asarray(point, np.float64), k, filters)) if entry else None
 
     def _near(self, memory: str, at: NDArray[np.float64], k: int, filters: CatalogFilters) -> list[CatalogInstance]:
-        """Return the k nearest: of those within a distance that grows until they are enough."""
+        """Return the k nearest, within a distance that grows until it holds enough."""
         reach, farthest = 1.0, np.inf
         while True:
             found = self._inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
@@ -338,13 +338,13 @@ def _columns_of(t: CatalogInstance) -> tuple[object, ...]:
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
-    """Over all memories: what has a word is looked up."""
+    """Over all memories: instances are looked up by word."""
     one = f"{alias}.number IN (SELECT number FROM word WHERE word = ?)"
     return " AND ".join([one] * len(words)), list(words)
 
 
 def _bearing_here(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
-    """In one memory: each of its instances is looked at."""
+    """In one memory: each of its instances is tested."""
     one = f"EXISTS (SELECT 1 FROM word WHERE word = ? AND number = {alias}.number)"
     return " AND ".join([one] * len(words)), list(words)
 

@@ -1,4 +1,4 @@
-"""What the commands share: how options are read and how results are shown."""
+"""Shared parts of the commands: reading of options and output of results."""
 
 from __future__ import annotations
 
@@ -50,10 +50,8 @@ def asked_at() -> int | None:
 
 @contextlib.contextmanager
 def open_memory(path: Path, min_confidence: float | None = None) -> Iterator[SceneMemory]:
-    """The memory behind a path, for reading: as it is, as it was after the session of `--at`, or all of it that is at
-    least so sure, scraps too.
-
-    All that is read belongs to one state, whatever a build or an update commits meanwhile.
+    """The memory of a path, for reading: now, after the session of `--at`, or with all segments of a least confidence.
+    All reads see one state, also while a build or an update commits.
     """
     from list3r.api import open as open_scene
 
@@ -88,10 +86,9 @@ def only(*names: str) -> tuple[str, ...]:
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with one option for each field of those of its parameters that are dataclasses of options.
-
-    `source: SourceArguments` in its signature stands for all fields of `SourceArguments`, in that place and order. A
-    field that is such a dataclass itself stands for its own fields.
+    """Return the command with parameters that are dataclasses of options expanded to one option for each field.
+    `source: SourceArguments` in its signature becomes all fields of `SourceArguments`, in that place and order. A field
+    that is such a dataclass itself is expanded too.
     """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
@@ -115,7 +112,7 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options_of(group: Any) -> list[inspect.Parameter]:
-    """Return the options that a dataclass stands for."""
+    """Return the options that a dataclass represents."""
     types = get_type_hints(group, include_extras=True)
     inner = [
         _options_of(types[f.name]) if is_dataclass(types[f.name]) else [_as_option(f, types[f.name])]
@@ -153,7 +150,7 @@ def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:
 
 
 def _choices(metavar: str) -> Callable[[], list[str]] | None:
-    """Return what a shell completes, of an option that is one of several words."""
+    """Return the completions of an option that is one of several words."""
     return metavar.split("|").copy if "|" in metavar and metavar.islower() else None
 
 
@@ -189,7 +186,5 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
 
 
 def in_column(name: str) -> str:
-    """Return what somebody called a thing for a table: of blanks in a row, which look like the gap between columns,
-    only the first stays one.
-    """
+    """Return a name for a table: repeated blanks, which look like a gap between columns, are escaped."""
     return re.sub(r"(?<= ) +", lambda blanks: r"\x20" * len(blanks[0]), name)

@@ -1,4 +1,4 @@
-"""Whether things keep their ids over time: masks of every frame against the true ids of its pixels."""
+"""Whether objects keep their ids over time: masks of every frame against the true ids of its pixels."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class IdentityErrors(JsonFields):
-    """Ids that true objects carry over time."""
+    """Estimated ids of true objects over time."""
 
     frames: int
-    """Frames that were looked at."""
+    """Compared frames."""
     objects: int
     """True objects that some mask covered in some frame."""
     switches: int
     """Times that an object's id is another one than when it was covered last (CLEAR MOT's mismatches)."""
     several_ids: dict[int, tuple[int, ...]]
-    """Objects that carried more than one id, with the ids in the order in which they came."""
+    """Objects that had more than one id, with the ids in the order in which they came."""
 
 
 def evaluate_identities(
@@ -38,8 +38,8 @@ def evaluate_identities(
     """Follow the ids of true objects.
 
     Each frame is the true ids of its pixels (H, W), 0 for nothing, and the estimated masks (H, W) with their ids. An
-    object carries an id when that mask's IoU with its pixels is `least_iou` or more; while the id it had last does, it
-    keeps it. `wanted` are the true ids that count, None all. Raises `OptionError` for masks of another size.
+    object has an id when that mask's IoU with its pixels is `least_iou` or more; its last id has priority. `wanted` are
+    the counted true ids, None for all. Raises `OptionError` for masks of another size.
     """
     carried: dict[int, list[int]] = {}
     count = switches = 0

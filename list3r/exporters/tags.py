@@ -29,15 +29,15 @@ class TagTarget:
 
     @property
     def small(self) -> bool:
-        """Whether a tag on top would hide the thing."""
+        """Whether a tag on top would hide the instance."""
         return self.half[0] < self.tag[0] or self.half[1] < self.tag[1] * 1.2
 
 
 def place_tags(anchors: Sequence[TagTarget], page: Rect) -> list[tuple[float, float]]:
-    """Return the middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
+    """Return the middles of the tags, px, one for each anchor: the nearest place that is free, small instances first.
 
-    Tags avoid each other and the small things, and the lines to tags avoid each other. Where nothing is free within the
-    search radius the place of least overlap is taken.
+    Tags avoid each other and the small instances, and the lines to tags avoid each other. Where nothing is free within
+    the search radius the place of least overlap is taken.
     """
     leaders: list[tuple[float, float, float, float]] = []
     boxes = [_around(a.xy, a.half) for a in anchors if a.small]
@@ -88,7 +88,7 @@ def crossings(start: NDArray[np.float64], ends: NDArray[np.float64], leaders: ND
 
 
 def _side(a: NDArray[np.float64], b: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Tell on which side of the line from a to b a point lies, by sign."""
+    """Return the side of the line from a to b on which a point is, by sign."""
     return np.asarray((b - a)[..., 0] * (p - a)[..., 1] - (b - a)[..., 1] * (p - a)[..., 0])
 
 

@@ -1,6 +1,6 @@
-"""A COLMAP model whose pictures have masks of things: every point belongs to what most of its pictures say.
+"""A COLMAP model whose pictures have masks of objects: every point belongs to the object of most of its pictures.
 
-`sparse/0` is the model, `masks/` holds a PNG for each picture (its name with `.png`) with the number of the thing in
+`sparse/0` is the model, `masks/` holds a PNG for each picture (its name with `.png`) with the number of the object in
 each pixel, the same number in all pictures, 0 for nothing. The model has a unit of its own.
 """
 
@@ -25,7 +25,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> ImportedMap:
-    """Return the things that masks make of the model's points. Raises `SourceError`."""
+    """Return the objects that masks make of the model's points. Raises `SourceError`."""
     from pycolmap import Reconstruction
 
     model = _model(path)

@@ -30,7 +30,7 @@ def read(path: Path) -> ImportedMap:
     if file is None:
         raise SourceError(
             f"{path} is a pickle, which runs code when it is read; give obj_json_*.json, which ConceptGraphs writes "
-            "beside it (save_obj_json: true)"
+            "next to it (save_obj_json: true)"
         )
     content = read_json_file(file)
     if not isinstance(content, dict) or not content:

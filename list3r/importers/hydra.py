@@ -1,8 +1,8 @@
 """Scene graphs of Hydra and Khronos: the JSON of spark-dsg (`dsg.json`).
 
-Nodes carry `attributes` of a `type`; objects are those of `ObjectNodeAttributes` and its kin, with `name`,
-`semantic_label`, `bounding_box` and the numbers of the mesh's vertices. Boxes have `dimensions` since version 1.0.3 and
-`min`, `max` before; where the file holds the mesh, things get its points.
+Nodes have `attributes` of a `type`; objects have `ObjectNodeAttributes` or a kind of it, with `name`, `semantic_label`,
+`bounding_box` and the numbers of the mesh's vertices. Boxes have `dimensions` since version 1.0.3 and `min`, `max`
+before; where the file holds the mesh, objects get its points.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _object(
 
 
 def _label(attributes: Mapping[str, Any], labels: Mapping[int, str]) -> str | None:
-    """Return the name of a thing or of its class; "class 7" where only the number is said."""
+    """Return the name of an object or of its class; "class 7" where only the number is said."""
     name, number = attributes.get("name"), attributes.get("semantic_label")
     if isinstance(name, str) and name and not name.endswith(")"):
         return name

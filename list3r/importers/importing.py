@@ -1,4 +1,4 @@
-"""A memory of a map that another program made: its things as one chunk, related and named by our own rules."""
+"""A memory of a map that another program made: its objects as one chunk, related and named by our own rules."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ _SURE = 0.98
 
 @dataclass(frozen=True)
 class ImportReport(JsonFields):
-    """What was imported."""
+    """Result of an import."""
 
     format: str
     objects: int
-    """Things of the map."""
+    """Objects of the map."""
     instances: int
     """Instances that they became."""
     structure: int
     relations: int
     ids: dict[str, int]
-    """Instance by the map's own name of the thing."""
+    """Instance by the map's own name of the object."""
     notes: tuple[str, ...]
 
 
 def import_map(path: str | Path, memory: str | Path, *, kind: str = "auto", up: str = "z") -> ImportReport:
     """Make a memory of a map of another program. `up` is the axis of its world that points up: x, y, z, -x, -y or -z.
 
-    Raises `SourceError` for what is no such map, `OptionError`, and `MemoryFileError` for a memory that exists.
+    Raises `SourceError` for another kind of file, `OptionError`, and `MemoryFileError` for a memory that exists.
     """
     source, target = Path(path).expanduser(), Path(memory)
     check_choice("--up", up, _TURNS)
@@ -54,7 +54,7 @@ def import_map(path: str | Path, memory: str | Path, *, kind: str = "auto", up: 
         raise MemoryFileError(taken(target))
     found = read_map(source, kind)
     if len(found.objects) > _MOST_OBJECTS:
-        raise OptionError(f"{source} holds {len(found.objects)} things; at most {_MOST_OBJECTS} are imported")
+        raise OptionError(f"{source} holds {len(found.objects)} objects; at most {_MOST_OBJECTS} are imported")
     store = Store.create(target)
     try:
         report = _write(store, source, found, up)
@@ -99,10 +99,10 @@ def _write(store: Store, source: Path, found: ImportedMap, up: str) -> ImportRep
     ids = {found.objects[o.local_id].name: o.instance_id for o in store.observations.all()}
     notes = (*found.notes, *up_axis_notes([t.points for t in found.objects], up))
     if len(names) < len(found.objects):
-        notes = (*notes, "several things of the map have the same name")
+        notes = (*notes, "several objects of the map have the same name")
     left = len(found.objects) - len(store.observations.all())
     if left:
-        notes = (*notes, f"{left} things of the map became no instance of their own")
+        notes = (*notes, f"{left} objects of the map became no instance of their own")
     instances, structure = store.instances.count()
     relations = len(store.relations.all())
     return ImportReport(found.format, len(found.objects), instances, structure, relations, ids, notes)
@@ -147,7 +147,7 @@ def _local(number: int, obj: ImportedObject, R: NDArray[np.float64], size: int) 
 
 
 def _unseen() -> MaskTrack:
-    """A track without frames: the map does not say in which pictures a thing is."""
+    """A track without frames: the map does not say in which pictures an object is."""
     return MaskTrack(
         frames=np.zeros(0, np.int64),
         boxes_xyxy=np.zeros((0, 4), np.float32),

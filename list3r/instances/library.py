@@ -28,11 +28,11 @@ def build_library(
     discoverer: Discoverer | None = None,
     tracker: Tracker | None = None,
 ) -> LocalLibrary:
-    """Find the things of a chunk and follow them through it.
+    """Find the objects of a chunk and follow them through it.
 
-    `frames` are the chunk's frames in the order of the reconstruction. Without a discoverer and a tracker those
-    are used that need no weights from elsewhere. What the reconstruction found to move of its own is added as
-    instances that are `dynamic`; the others do not see it, for it has no depth there.
+    `frames` are the chunk's frames in the order of the reconstruction. The default discoverer and tracker need no
+    downloaded weights. Moving objects of the reconstruction are added as `dynamic` instances; discovery does not see
+    them, as the reconstruction has no depth there.
     """
     settings = settings or InstanceSettings()
     discoverer = discoverer or LearnedDiscoverer(settings)

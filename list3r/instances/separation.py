@@ -1,4 +1,4 @@
-"""Cannot-link evidence: pairs that are two things because one frame shows both (paper 3.1)."""
+"""Cannot-link evidence: pairs that are two objects because one frame shows both (paper 3.1)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from list3r.memory.records import LocalInstance
 WELL_VISIBLE = 0.3
 """Share of an instance's support that must be seen for its mask to count."""
 TOUCHING_M = 0.03
-"""Things nearer than this may be pieces of one, unless a surface parts them."""
+"""Objects nearer than this may be pieces of one, unless a surface parts them."""
 PIECE_M = 0.25
-"""Instances smaller than this in every direction are small things."""
+"""Instances smaller than this in every direction are small objects."""
 COLOR_DIFFERENCE = 12.0
-"""From this on two flat things in one plane are a sheet and what it lies on."""
+"""From this on two flat objects in one plane are a sheet and its support."""
 ROOM_M = 0.6
 """Pieces of one piece of furniture are seldom farther apart than this."""
 
 
 def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: float) -> NDArray[np.int32]:
-    """Pairs of local ids seen side by side in at least `frames` frames and not possibly pieces of one. Shape (P, 2).
+    """Pairs of local ids seen side by side in at least `frames` frames that cannot be pieces of one. Shape (P, 2).
 
-    An over-segmented thing looks just like two things side by side. So a pair only counts when a surface parts it
-    (one stands on the other), when they lie in one plane and differ in colour, when both are small and apart, or
-    when they are far apart and not in one plane.
+    An over-segmented object looks just like two objects side by side. So a pair only counts when a surface parts it
+    (one is on the other), when they are in one plane and differ in colour, when both are small and apart, or when they
+    are far apart and not in one plane.
     """
     well = [_well_visible(instance) for instance in instances]
     parts = [_Part.of(instance) for instance in instances]
@@ -44,7 +44,7 @@ def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: flo
 
 @dataclass(frozen=True)
 class _Part:
-    """An instance with what every comparison of it needs."""
+    """An instance with values that every comparison needs."""
 
     instance: LocalInstance
     low: NDArray[np.float32]
@@ -97,7 +97,7 @@ def _gap(a: _Part, b: _Part, far: float) -> float:
 
 
 def _on_plane(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
-    """True where the flat a lies in the plane of b."""
+    """True where the flat a is in the plane of b."""
     assert b.plane is not None
     return bool(np.median(np.abs(a.support.points @ b.plane[:3] + b.plane[3])) < 0.05 * unit)
 

@@ -1,4 +1,4 @@
-"""A simulated walk as a folder in the TUM RGB-D layout, with the truth beside it."""
+"""A simulated walk as a folder in the TUM RGB-D layout, with the truth next to it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _BATCH = 12
 
 @dataclass(frozen=True)
 class WalkSettings:
-    """A walk through two furnished rooms. Subclasses film other worlds, other ways or things that move."""
+    """A walk through two furnished rooms. Subclasses film other worlds, other ways or objects that move."""
 
     seed: int = 0
     """Decides the world."""
@@ -50,7 +50,7 @@ class WalkSettings:
     sensor: SensorSettings = field(default_factory=SensorSettings)
     lighting: Lighting = field(default_factory=Lighting)
     write_ids: bool = False
-    """Also write `ids/`: the id of the thing in every pixel, 16 bit."""
+    """Also write `ids/`: the id of the object in every pixel, 16 bit."""
 
     def __post_init__(self) -> None:
         if self.frames is not None and self.frames < 2:
@@ -80,11 +80,12 @@ class WalkSettings:
         return time_s[self.start :], poses[self.start :]
 
     def movers(self) -> tuple[MovingObject, ...]:
-        """Return what moves while it is filmed, with its pose in each of the frames to be written."""
+        """Return the moving objects, with their poses in the frames to be written."""
         return ()
 
     def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
-        """Return the content of `truth.json`; `seen` has the counts of each thing's id, as `world_truth` takes them."""
+        """Return the content of `truth.json`; `seen` has the counts of each object's id, as `world_truth` takes
+        them."""
         return world_truth(self.world(), seen)
 
 
@@ -140,7 +141,7 @@ class _Writer:
         self._seed = settings.seed if settings.walk_seed is None else settings.walk_seed
 
     def write_span(self, span: tuple[int, int]) -> list[dict[int, int]]:
-        """Write the frames at positions [start, stop); returns the areas of the things in each."""
+        """Write the frames at positions [start, stop); returns the areas of the objects in each."""
         return [self._write(position) for position in range(*span)]
 
     def _write(self, position: int) -> dict[int, int]:

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PathSettings:
-    """How the camera moves. The limits are those of a person who films a room and means to."""
+    """How the camera moves. The limits are those of a person who films a room on purpose."""
 
     fps: float = 12.0
     speed_m_s: float = 0.5
@@ -44,8 +44,8 @@ def camera_path(
 ) -> tuple[Array, Array]:
     """Times and poses of a walk past the stops.
 
-    Returns seconds (F,) and T_world_cam (F, 4, 4), camera axes x right, y down, z forward. None for `frames` takes
-    what the whole round needs; fewer cut it short, more walk it slower.
+    Returns seconds (F,) and T_world_cam (F, 4, 4), camera axes x right, y down, z forward. None for `frames` takes as
+    many as the whole round needs; fewer cut it short, more walk it slower.
     """
     clock, eye, yaw, pitch = _path(stops, settings)
     needed = int(np.ceil(clock[-1] * settings.fps)) + 1

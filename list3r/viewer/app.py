@@ -91,8 +91,8 @@ class Viewer:
             return read_world(before, changes)
 
     def show(self, **changed: Any) -> None:
-        """Change what is shown: fields of `ViewState`. Raises `List3rError`, and nothing changes, where the memory as
-        it was after a session cannot be read.
+        """Change what is shown: fields of `ViewState`. Raises `List3rError`, and nothing changes, where a past state of
+        the memory cannot be read.
         """
         with self._lock:
             before, wanted = self.state, replace(self.state, **changed)
@@ -112,7 +112,7 @@ class Viewer:
             self.draw()
 
     def draw(self) -> None:
-        """Draw everything and say what is selected."""
+        """Draw everything and describe the selection."""
         with self._lock, self.server.atomic():
             s, world, unit = self.state, self.world, self.world.unit
             self._layers.highlight(world, s.colors, s.selected, visible=s.points)
@@ -123,7 +123,7 @@ class Viewer:
             if s.selected is not None:
                 self._tell(s.selected)
             else:
-                self.panel.tell("Click a thing, or search for one.", None)
+                self.panel.tell("Click an instance, or search for one.", None)
         self._draw_points()
         for page in self._open_pages():
             page.names.draw(self.world, self.state.selected, visible=self.state.labels)
@@ -156,7 +156,8 @@ class Viewer:
     # ------------------------------------------------------------------ what a user does
 
     def find(self, text: str) -> list[int]:
-        """Search, select the best answer and look at it; the ids that answer. The panel says what was not found."""
+        """Search, select the best answer and look at it; the ids that answer. The panel names words that were not
+        found."""
         found = self.memory.find(text, 10)
         ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
         self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join(found.notes))
@@ -173,7 +174,7 @@ class Viewer:
             for client in self.server.get_clients().values():
                 away = client.camera.position - client.camera.look_at
                 away = away / max(float(np.linalg.norm(away)), 1e-9)
-                client.camera.position = i.center + 3.0 * reach * away  # takes what is looked at along
+                client.camera.position = i.center + 3.0 * reach * away  # moves the target along
                 client.camera.look_at = i.center
 
     def measure(self) -> None:
@@ -194,7 +195,7 @@ class Viewer:
             self._layers.camera(self.path, k, rgb, (camera.intrinsics[1], width, height), self.world.unit)
 
     def edit(self, change: Callable[[], Any]) -> None:
-        """Run one edit and show what it did, or why it was refused."""
+        """Run one edit and show its result, or why it was refused."""
         try:
             report = change()
         except List3rError as error:
@@ -231,7 +232,7 @@ class Viewer:
         names.draw(self.world, self.state.selected, visible=self.state.labels)
 
     def _follow(self, view: ViewState) -> None:
-        """Show what a link names, as far as this memory has it, and say what is left out."""
+        """Show the view of a link, as far as this memory has it, and name what is missing."""
         left_out = []
         if self._dropped:
             self._dropped = False
@@ -245,7 +246,7 @@ class Viewer:
             left_out.append(f"The link cannot be followed: {error}.")
         else:
             if view.selected != self.state.selected:
-                left_out.append(f"There is no thing {view.selected}, which the link names.")
+                left_out.append(f"There is no instance {view.selected}, which the link names.")
         self.panel.say(" ".join(left_out))
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:

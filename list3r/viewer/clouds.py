@@ -16,12 +16,12 @@ from list3r.viewer.names import PageNames
 from list3r.viewer.world import ShownCloud, ShownWorld, close_by, color_of, colors, overview
 
 FINE = "/fine"
-"""What stands below this node is hidden while the camera of a slow page moves."""
+"""Nodes below this one are hidden while the camera of a slow page moves."""
 _BOX = 25
 """A box of thin lines takes as long to draw as this many points."""
 _POINT_M, _COARSE_M = 0.012, 0.03
 _MOVED_SHARE = 0.1
-"""The camera must move by this share of its distance to what it looks at before detail is drawn again."""
+"""The camera must move by this share of its distance to its target before detail is drawn again."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class CloudSettings:
     overview_points: int = 1_500_000
     """Points that are always there, at most."""
     detail_points: int = 1_500_000
-    """Points that come besides near the camera, at most."""
+    """Further points near the camera, at most."""
     rest_s: float = 0.5
     """All that is drawn while the camera rests takes a page no longer than this."""
     moving_s: float = 0.04
@@ -39,7 +39,7 @@ class CloudSettings:
     probe_points: tuple[int, ...] = (30_000, 300_000)
     """Points whose drawing is timed; a graphics card takes a millisecond or two for the most of them."""
     probe_s: float = 0.05
-    """What takes longer is not timed with more points."""
+    """Slower drawing is not timed with more points."""
     never_slow_points: int = 20_000
     """Memories with fewer points are drawn in full without timing."""
     pause_s: float = 1.0
@@ -48,7 +48,7 @@ class CloudSettings:
 
 @dataclass(frozen=True)
 class Shown:
-    """What of a world is drawn."""
+    """Drawn layers of a world."""
 
     world: ShownWorld = field(compare=False)
     mode: str
@@ -68,7 +68,7 @@ class Shown:
 
 
 class PageClouds:
-    """The points of one page, drawn in its own part of the scene, so that each page gets what it can draw."""
+    """The points of one page, drawn in its own part of the scene, so that each page gets as many as it can draw."""
 
     def __init__(self, client: viser.ClientHandle, settings: CloudSettings, names: PageNames) -> None:
         self._client, self._settings, self.names = client, settings, names
@@ -83,7 +83,7 @@ class PageClouds:
 
     @property
     def settled(self) -> bool:
-        """Whether the page shows what it shows at rest."""
+        """Whether the page shows its picture at rest."""
         with self._lock:
             return FINE in self._nodes and not self._moving
 
@@ -93,7 +93,7 @@ class PageClouds:
         return np.inf if self.seconds_a_point is None else self._settings.rest_s / max(self.seconds_a_point, 1e-12)
 
     def draw(self, shown: Shown) -> None:
-        """Draw a world; the first time, what the page takes to draw is measured."""
+        """Draw a world; the first time, the page's drawing speed is measured."""
         with self._lock:
             before, self._shown = self._shown, shown
             if before is None and shown.world.cloud.counts.sum() > self._settings.never_slow_points:

@@ -1,4 +1,4 @@
-"""What stands in the 3D scene of all pages: boxes, path, and lines of the selected instance."""
+"""The 3D scene of all pages: boxes, path, and lines of the selected instance."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class LayerSettings:
     """How much is drawn."""
 
     selected_points: int = 100_000
-    """Points of the selected thing that are tinted, at most."""
+    """Points of the selected instance that are tinted, at most."""
     frustums: int = 40
 
 
 class Layers:
-    """The scene of one server; every layer is drawn again when what it shows changes."""
+    """The scene of one server; every layer is drawn again when its content changes."""
 
     def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
         self._scene, self._settings = server.scene, settings
@@ -107,7 +107,7 @@ class Layers:
         ]  # fmt: skip
 
     def relations(self, world: ShownWorld, selected: int, relations: Sequence[Relation]) -> None:
-        """Draw lines from the selected instance to those it is related to, with what relates them."""
+        """Draw lines from the selected instance to related ones, with their predicates."""
         self.clear("relations")
         start = world.instances[selected].center
         words: dict[int, list[str]] = {}
@@ -127,7 +127,7 @@ class Layers:
         self._nodes["relations"] = nodes
 
     def changes(self, world: ShownWorld, *, visible: bool) -> None:
-        """Draw where things were before: arrows of what moved, boxes of what is gone."""
+        """Draw where instances were before: arrows of moved ones, boxes of removed ones."""
         self.clear("changes")
         if not visible:
             return

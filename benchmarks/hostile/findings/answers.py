@@ -97,7 +97,7 @@ def verify_of_the_past(place: Place) -> str:
 
 
 def past_and_present_mixed(place: Place) -> str:
-    """Another process deletes a thing while the past is read: it is there in all tables or in none."""
+    """Another process deletes an object while the past is read: it is there in all tables or in none."""
     memory = place.two_sessions()
     with importlib.import_module("list3r").open(memory, at=1) as scene:
         scene.instances()

@@ -1,4 +1,4 @@
-"""Where a finding is looked for: a folder, and the program of the checkout that this process was started for.
+"""The place of a test for a finding: a folder, and the program of this process's checkout.
 
 Uses of the program only what both the old and the present one have: its commands, `list3r.open`, and the small memory
 of its own tests.
@@ -28,7 +28,7 @@ import numpy as np
 from PIL import Image
 
 MOST_ADDRESSES = 6 * 2**30
-"""Address space of a command, bytes: what takes more ends, and not the machine."""
+"""Address space of a command, bytes: a command that takes more is ended."""
 PRECIOUS = b"my own words; they stay\n" * 100
 
 

@@ -1,4 +1,4 @@
-"""query changes: what sessions have changed."""
+"""query changes: changes between sessions."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from list3r.cli.terminal import note
 def changes(
     memory: MemoryArgument,
     since: Annotated[
-        int | None, typer.Option("--since", metavar="SESSION", help="Only what changed after this session.")
+        int | None, typer.Option("--since", metavar="SESSION", help="Only changes after this session.")
     ] = None,
-    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also things that were found unchanged.")] = False,
+    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also instances that were found unchanged.")] = False,
     min_confidence: Annotated[
         float, typer.Option("--min-confidence", help="Only changes with at least this confidence.")
     ] = 0.0,
     json: JsonOption = False,
 ) -> None:
-    """The things that were moved, removed or added between sessions, with frames that show it.
+    """The instances that were moved, removed or added between sessions, with frames that show it.
 
     Example: list3r query changes house.l3r --since 1
     """

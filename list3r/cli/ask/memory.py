@@ -1,4 +1,4 @@
-"""info, list, show: what a memory holds."""
+"""info, list, show: the content of a memory."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def list_instances(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
+            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
         ),
     ] = None,
     at: Annotated[
@@ -107,11 +107,11 @@ def list_instances(
             doubtful = len(scene.instances(structure=False))
         if doubtful:
             kind = "1 doubtful instance is" if doubtful == 1 else f"{doubtful} doubtful instances are"
-            note(f"{kind} not listed: --min-confidence 0 shows what there is")
+            note(f"{kind} not listed: --min-confidence 0 shows all")
 
 
 def _give_or_take(sigma: float | None, units: str) -> str:
-    """How sure a position is, where the memory can tell."""
+    """Uncertainty of a position, where it is known."""
     return "" if sigma is None else f", give or take {sigma:.2f} {units} against the start"
 
 
@@ -180,7 +180,7 @@ def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
 
 
 def _track_lines(times_s: Any, places: Any, units: str) -> list[tuple[str, str]]:
-    """Fields of a moving thing: when, how far, from where to where."""
+    """Fields of a moving instance: when, how far, from where to where."""
     if not len(times_s):
         return [("moved", "seen moving; where it was is not known")]
     way = sum(math.dist(a, b) for a, b in itertools.pairwise(places.tolist()))

@@ -27,7 +27,7 @@ from list3r.cli.terminal import note, say
 def nearest(
     memory: MemoryArgument, near: NearArguments, *, k: Count = 5, filters: FilterArguments, json: JsonOption = False
 ) -> None:
-    """The things nearest to a point or an instance, with distances of surfaces and of centres.
+    """The instances nearest to a point or an instance, with distances of surfaces and of centres.
 
     Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
     """
@@ -53,11 +53,11 @@ def within(
     region: RegionArguments,
     camera: Annotated[CameraArguments, only("view", "pose", "session", "max_depth")],
     *,
-    occlusion: Annotated[bool, typer.Option(help="Leave out what other things hide from the camera.")] = True,
+    occlusion: Annotated[bool, typer.Option(help="Leave out instances that others hide from the camera.")] = True,
     filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
 ) -> None:
-    """The things inside a box or a sphere, or those that a camera sees.
+    """The instances inside a box or a sphere, or those that a camera sees.
 
     Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
     """
@@ -71,7 +71,7 @@ def within(
 
 
 def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False) -> None:
-    """The relations between things, by subject, predicate and object.
+    """The relations between instances, by subject, predicate and object.
 
     Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
     """
@@ -87,7 +87,7 @@ def similar(
     filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
 ) -> None:
-    """The things that look most like one instance, or like a picture.
+    """The instances most similar in appearance to one instance or to a picture.
 
     Example: list3r query similar house.l3r --image mug.jpg --box 120,80,180,150
     """
@@ -95,7 +95,7 @@ def similar(
 
     with open_memory(memory, filters.min_confidence) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
-            raise OptionError("give what to compare with: --id ID, or --image FILE, with --box for a part of it")
+            raise OptionError("give a query: --id ID, or --image FILE, with --box for a part of it")
         if like.image is not None:
             found = scene.similar_to_picture(like.image, k, box_xyxy=like.corners(), **filters.options())
         else:
@@ -109,7 +109,7 @@ def find(
     text: Annotated[
         str,
         typer.Argument(
-            metavar="TEXT", help="Description of the thing and its relations to others.", show_default=False
+            metavar="TEXT", help="Description of the instance and its relations to others.", show_default=False
         ),
     ],
     k: Count = 5,
@@ -119,7 +119,7 @@ def find(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """The things that a text describes by attributes, a noun and relations; an id can stand for a thing.
+    """The instances that a text describes by attributes, a noun and relations; an id can replace words.
 
     Example: list3r query find house.l3r "white mug on table"
     """
@@ -199,7 +199,7 @@ def path(
 
 
 questions = typer.Typer(
-    help="Ask what is near, inside, visible, similar, related, described by words, or changed.",
+    help="Find instances that are near, inside, visible, similar, related, described by words, or changed.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )

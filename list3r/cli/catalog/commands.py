@@ -116,9 +116,7 @@ def check(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
 def rebuild(
     files: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[FILE...]", help="Memory files, or folders of them; default: those that the catalogue knows."
-        ),
+        typer.Argument(metavar="[FILE...]", help="Memory files, or folders of them; default: all in the catalogue."),
     ] = None,
     catalog: CatalogOption = _DEFAULT,
     json: JsonOption = False,

@@ -42,7 +42,7 @@ def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
         typer.Option("--catalog", metavar="URL", help=f"Ask a catalogue; MEMORY is a name in it, or {ALL}."),
     ]
     everywhere = Annotated[
-        bool, typer.Option("--everywhere", help="With --catalog: compare with the things of all memories.")
+        bool, typer.Option("--everywhere", help="With --catalog: compare with the instances of all memories.")
     ]
     kinds: dict[str, Any] = {"catalog": option, **({"everywhere": everywhere} if name == "similar" else {})}
     defaults = {"catalog": None, "everywhere": False}
@@ -72,7 +72,7 @@ def _option_error(text: str) -> Exception:
 
 
 def _check(name: str, arguments: Arguments, signature: inspect.Signature) -> None:
-    """Raise `OptionError` for what is asked that only a file can tell."""
+    """Raise `OptionError` for options that only a file can answer."""
     if asked_at() is not None:
         raise _option_error("--at is not available for a catalogue; leave it out, or ask the memory file")
     for word, value in arguments.items():

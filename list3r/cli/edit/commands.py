@@ -1,4 +1,4 @@
-"""merges, undo, merge, split, label, delete: what an operator puts right."""
+"""merges, undo, merge, split, label, delete: corrections by an operator."""
 
 from __future__ import annotations
 
@@ -84,11 +84,11 @@ def undo(
 def merge(
     memory: MemoryArgument,
     a: Annotated[int, typer.Argument(metavar="A", help="An instance.", show_default=False)],
-    b: Annotated[int, typer.Argument(metavar="B", help="The same thing under another id.", show_default=False)],
+    b: Annotated[int, typer.Argument(metavar="B", help="The same instance under another id.", show_default=False)],
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Merge two instances that are one thing: the older id stays, and the other resolves to it from then on.
+    """Merge two instances that are one instance: the older id stays, and the other resolves to it from then on.
 
     Example: list3r merge house.l3r 12 31
     """
@@ -110,7 +110,7 @@ def split(
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Split an instance that is two things: the larger part keeps the id.
+    """Split an instance that is two instances: the larger part keeps the id.
 
     Example: list3r split house.l3r 12 --out 3:4,5:2
     """

@@ -36,7 +36,7 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
         print_answer([{**facts, "sessions": state, "chunks": chunks}])
     elif found:
         say(*found)
-        say(f"`list3r repair {memory}` saves what is sound")
+        say(f"`list3r repair {memory}` saves the sound rows")
     else:
         unfinished = (
             "; the build is unfinished, continue with --resume" if any(s["state"] == "building" for s in state) else ""
@@ -69,7 +69,7 @@ def repair(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Repair a damaged memory: keep every sound row, derive the rest again, list what is lost. The original is kept.
+    """Repair a damaged memory: keep every sound row, derive the rest again, list losses. The original is kept.
 
     Example: list3r repair house.l3r
     """
@@ -94,7 +94,7 @@ def repair(
 
 
 def doctor(json: JsonOption = False) -> None:
-    """Check what is installed, what is missing, and what does not work without it.
+    """Check which packages are installed or missing, and the functions that need them.
 
     Example: list3r doctor
     """

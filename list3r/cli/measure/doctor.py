@@ -1,4 +1,4 @@
-"""What `list3r doctor` looks at."""
+"""Checks of `list3r doctor`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _PACKAGES = (
     ("open3d-cpu|open3d", "comparisons in benchmarks"),
 )
 _NEEDED = {"numpy", "scipy", "networkx", "faiss-cpu", "typer", "rich"}
-"""What asking a memory takes; the others come with extras, which a command that lacks one names."""
+"""Packages for queries; others come with extras, which a command that lacks one names."""
 _LIBRARIES = (
     ("GL", "Open3D only (apt-get install libgl1 libegl1)"),
     ("gomp", "threads of torch and faiss, where their packages bring none (apt-get install libgomp1)"),
@@ -50,7 +50,7 @@ _LIBRARIES = (
 
 
 def findings() -> list[tuple[str, str, str]]:
-    """(part, state, what it is needed for); a state that begins with MISSING needs mending."""
+    """(part, state, purpose); a state that begins with MISSING is an error."""
     rows = [
         ("system", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}", "everything"),
         ("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()), "speed"),

@@ -1,4 +1,4 @@
-"""What the eval commands compare: trajectories, frames, clouds, scenes and masks behind a path."""
+"""Inputs of the eval commands: trajectories, frames, clouds, scenes and masks behind a path."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def scale_of(path: Path) -> str:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """The poses of a TUM file, a memory, or a source. Says on standard error what a memory leaves out."""
+    """The poses of a TUM file, a memory, or a source. Reports omitted poses of a memory on standard error."""
     from list3r.evaluation.trajectory import read_tum
 
     if is_source(path):
@@ -191,7 +191,7 @@ def _fused(path: Path, every: int | None) -> tuple[PointCloud, Trajectory]:
 
 
 def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
-    """All supports of things and surfaces in a memory's main part."""
+    """All supports of instances and surfaces in a memory's main part."""
     import numpy as np
 
     from list3r.evaluation.point_clouds import PointCloud
@@ -206,7 +206,7 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
     if not len(points):
         raise OptionError(f"{path} holds no surface point; finish its build with --resume")
     surfaces = sum(i.structure is not None for i in main.instances)
-    text = f"{len(points):,} points of {len(supports) - surfaces} things and {surfaces} surfaces"
+    text = f"{len(points):,} points of {len(supports) - surfaces} instances and {surfaces} surfaces"
     return PointCloud(points, None, text), _stored(path)
 
 

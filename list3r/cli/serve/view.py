@@ -27,7 +27,7 @@ def view(
     from list3r.memory.errors import OptionError
 
     if not 0 < port <= 65535:
-        raise OptionError(f"--port {port} must lie between 1 and 65535")
+        raise OptionError(f"--port {port} must be between 1 and 65535")
     from list3r.viewer.app import Viewer, ViewerSettings, serve
 
     with contextlib.ExitStack() as stack:

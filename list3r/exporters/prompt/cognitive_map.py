@@ -1,4 +1,4 @@
-"""The things of a memory on coarse grids seen from above, as language models are asked to imagine them."""
+"""The instances of a memory on coarse grids seen from above, as language models are asked to imagine them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GRIDS = (10, 20)
 def cognitive_maps(instances: Sequence[Instance], units: str) -> dict[str, Any]:
     """Return the grids of every part of a memory that shares one frame of reference, as plain JSON values.
 
-    A grid is a square that holds the centres of all things; cells are [column, row], counted from 0 along +x and +y.
+    A grid is a square that holds the centres of all instances; cells are [column, row], counted from 0 along +x and +y.
     `objects` gives the cells by name and `instances` by id.
     """
     placed = [i for i in instances if i.structure is None and np.isfinite(i.center).all()]

@@ -1,4 +1,4 @@
-"""Set-of-marks: the outline and the id of every instance on a stored picture, so that words can point at things."""
+"""Set-of-marks: the outline and the id of every instance on a stored picture, so that words can point at instances."""
 
 from __future__ import annotations
 

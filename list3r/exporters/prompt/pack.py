@@ -29,14 +29,14 @@ _OURS = "list3r-prompt.json"
 
 @dataclass(frozen=True)
 class PackSettings:
-    """What a pack shows."""
+    """Content of a pack."""
 
     tokens: int = 2000
     """Budget of the text."""
     question: str | None = None
-    """What its words name comes first."""
+    """Instances that it names come first."""
     objects_on_grids: int = 2000
-    """In a memory of more things the grids of the cognitive map hold only those that have a row in the text."""
+    """In a memory of more instances the grids of the cognitive map hold only instances with a row in the text."""
     least_visible: float = 0.3
     """Share of an instance that must show for a view to count for it."""
     least_side_px: float = 12.0
@@ -47,7 +47,7 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
     """Write scene.md, cognitive_map.json, map.png, views/ and crops/ to a folder; return the files.
 
     The views are the fewest stored keyframes that together show every listed instance. An earlier pack is replaced,
-    another folder is not, and an interruption leaves what was there. Raises `OptionError` and `ExportError`.
+    another folder is not, and an interruption leaves the earlier state. Raises `OptionError` and `ExportError`.
     """
     folder, settings = Path(folder), settings or PackSettings()
     prompt = scene_prompt(memory, settings.tokens, settings.question)
@@ -115,7 +115,7 @@ def _write_views(
 
 
 def _write_crops(memory: SceneMemory, folder: Path, listed: Sequence[int]) -> set[int]:
-    """Write the best picture of each instance; the ids of those that have one."""
+    """Write the best picture of each instance; returns the ids of instances with a picture."""
     folder.mkdir()
     written = set()
     for instance_id in listed:

@@ -26,16 +26,16 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class SimreadySettings:
-    """What is written about props, and how they are made."""
+    """Content and making of props."""
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for no mass and no rigid body."""
     ids: tuple[int, ...] | None = None
-    """Of the things that become props; None for all."""
+    """Of the instances that become props; None for all."""
     workers: int | None = None
-    """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
+    """Worker processes; 0 for none, None for none with few props and one per core, at most 4, with many."""
     progress: Callable[[int, int], None] | None = None
-    """Called with how many of the things are done, and how many there are."""
+    """Called with how many of the instances are done, and how many there are."""
     one_folder: int = 1000
     """Of more props than this a thousand ids share a folder, `from_12000`."""
 
@@ -47,12 +47,12 @@ class SimreadySettings:
 
 
 def write_simready(store: Store, folder: str | Path, settings: SimreadySettings | None = None) -> tuple[Path, ...]:
-    """Write `NAME/simready_usd/NAME.usd` for each thing of the main component and `scene.usdc`; return the files.
+    """Write `NAME/simready_usd/NAME.usd` for each instance of the main component and `scene.usdc`; return the files.
 
     Props have a closed mesh, a material, labels, a collider, a thumbnail and metadata; with a density a rigid body
-    whose mass is an estimate, marked so. Structure is fixed and lies in the scene. What was seen to move, is gone, or
-    has too few points for a mesh has no prop. Raises `OptionError` for a memory without scale and for ids that allow
-    none.
+    whose mass is an estimate, marked so. Structure is fixed and is in the scene. Moving and removed instances, and
+    those with too few points for a mesh, have no prop. Raises `OptionError` for a memory without scale and for ids
+    without a prop.
     """
     folder, settings = Path(folder), settings or SimreadySettings()
     if units(store) != "m":
@@ -69,7 +69,7 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
             bare = sorted({i.id for i in objects} - {p.instance_id for p in props})
             raise OptionError(f"{_names_of(bare)}: too few surface points for a mesh; leave it out of the ids")
         fixed = [(i, mesh) for i in structure if (mesh := instance_mesh(store, i)) is not None]
-        scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
+        scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it is
         _fill_scene(Usd.Stage.Open(scene), props, fixed)
         with Sdf.ChangeBlock():  # without a stage, which would open the file of every prop
             for prop in props:
@@ -80,7 +80,7 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
 
 
 def _chosen(store: Store, settings: SimreadySettings) -> tuple[list[Instance], list[Instance]]:
-    """Return the things of the main component that become props where they have a mesh, and its structure."""
+    """Return the instances of the main component that become props where they have a mesh, and its structure."""
     there = [i for i in read_components(store)[0].instances if i.state != "removed" and has_box(i)]
     objects = [i for i in there if i.structure is None and not i.dynamic]
     if settings.ids is not None:
@@ -120,7 +120,7 @@ def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[I
 
 
 def _refer(layer: Sdf.Layer, prop: Prop) -> None:
-    """Add a prim that is the prop of a file, where the thing stands."""
+    """Add a prim that references a prop's file at the instance's pose."""
     spec = Sdf.CreatePrimInLayer(layer, f"/World/Props/{prop.name}")
     spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
     spec.referenceList.prependedItems = [Sdf.Reference(f"./{prop.file}")]

@@ -25,7 +25,7 @@ _NOT_STATED = "unknown"
 
 @dataclass(frozen=True)
 class PropFacts:
-    """What is said of all props of an export."""
+    """Facts about all props of an export."""
 
     date: str
     """Of the export, as 2026-01-31."""
@@ -37,13 +37,13 @@ class PropFacts:
     """Whether a thousand ids share a folder."""
 
     def part(self, instance_id: int) -> str:
-        """Return the folder in which a prop lies, from that of the export."""
+        """Return the folder of a prop, relative to the export."""
         return f"from_{instance_id // 1000 * 1000}" if self.parts else ""
 
 
 @dataclass(frozen=True)
 class Prop:
-    """Where a prop lies and how it is placed."""
+    """File and pose of a prop."""
 
     name: str
     file: str

@@ -1,9 +1,9 @@
-"""What came and went between sessions teaches what was there: surfaces that another session sees through.
+"""Instances found because they changed: surfaces of one session that another session sees through.
 
-A thing that discovery overlooked, or took for part of what it stands on, shows itself when it goes: its surface is in
-the keyframes of one session, and those of the other look through it. Such surfaces, gathered chunk by chunk into
-clusters, become local instances of the chunk that saw them, with masks in its frames, so that merging and the story of
-changes treat them like any other. Only what no instance of the chunk stands for already is added.
+Discovery may miss an object or segment it as part of its support. Once the object is gone, its surface is in the
+keyframes of one session and carved free by those of another. Such surfaces, clustered per chunk, become local instances
+of the chunk that saw them, with masks in its frames, so that merging and change detection treat them like any other.
+Only surfaces that no instance of the chunk explains are added.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ __all__ = ["ChangedPlaceSettings", "add_changed_places"]
 
 
 def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSettings | None = None) -> int:
-    """Add local instances for what a session shows to have gone or come and no instance stands for; how many.
+    """Add local instances for changed surfaces that no instance explains; returns how many.
 
-    Call inside a transaction, after the chunks are placed. Chunks whose features are not of the space that is computed
-    here are left as they are.
+    Call inside a transaction, after the chunks are placed. Chunks with features of another embedding space are left
+    unchanged.
     """
     s = settings or ChangedPlaceSettings()
     chunks = store.chunks.all()
@@ -96,7 +96,7 @@ def _is(chunk: ChunkRow, session_id: int) -> bool:
 
 
 def _clusters(points: Array, unit: float, s: ChangedPlaceSettings) -> list[Ints]:
-    """Rows of connected surfaces that are large enough for a thing, the largest first."""
+    """Rows of connected surfaces that are large enough for an object, the largest first."""
     if len(points) < s.least_cells:
         return []
     pairs = cKDTree(points).query_pairs(s.link_m * unit, output_type="ndarray")
@@ -114,10 +114,10 @@ def _is_object(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
 
 
 class _Change:
-    """What one chunk shows to have changed, world coordinates.
+    """Changed surfaces of one chunk, world coordinates.
 
-    `gone` are its surfaces that the other sessions see through, `came` theirs that it sees through, `compared` its
-    surfaces that the others see or see through. Shapes (N, 3).
+    `gone` are its surfaces that the other sessions see through, `came` the surfaces of others that it sees through,
+    `compared` all that the others observe. Shapes (N, 3).
     """
 
     def __init__(
@@ -128,10 +128,10 @@ class _Change:
         self._either = cKDTree(np.concatenate([gone, *came]))
 
     def explains(self, support: Array) -> bool:
-        """Return whether all of an instance has changed: what is not seen through lies where something else stands now.
+        """Return whether a whole instance has changed: its points are carved free or replaced by another surface.
 
-        Two solid things that stood at one place leave surfaces that both sessions measure, so an instance is not asked
-        to be seen through as a whole; what reaches beyond the change is a mixture of what went with what stayed.
+        Two solid objects at one place share surfaces that both sessions measure, so not all of an instance must be seen
+        through. An instance that extends beyond the change mixes removed and unchanged surfaces.
         """
         reach, link = 1.5 * self.settings.voxel_m * self.unit, self.settings.link_m * self.unit
         if len(support) == 0 or len(self.gone) == 0:
@@ -144,7 +144,7 @@ class _Change:
 
 
 def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[bool], chunk: ChunkRow) -> list[Array]:
-    """Clusters of surfaces that are gone and that no instance of the chunk stands for. Shapes (N, 3)."""
+    """Clusters of surfaces that are gone and that no instance of the chunk represents. Shapes (N, 3)."""
     s, unit, points = place.settings, place.unit, place.gone
     clusters = _clusters(points, unit, s)
     if not clusters:
@@ -168,7 +168,7 @@ def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[
 def _mixed_with(
     obj: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
 ) -> list[tuple[int, int]]:
-    """Pairs of a thing with the chunk's instances that hold part of it beside what stayed: they are not this thing."""
+    """Cannot-link pairs of an object with the chunk's instances that mix part of it with unchanged surfaces."""
     reach = 1.5 * s.voxel_m * unit
     out = []
     for node, stands in zip(nodes, standing, strict=True):

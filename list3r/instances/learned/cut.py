@@ -1,4 +1,4 @@
-"""A chunk's cloud cut into things by the trained networks: fine pieces first, then what they make up."""
+"""A chunk's cloud cut into objects by the trained networks: fine pieces first, then parts and objects."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ class CutSettings:
     sure: float = 3.5
     """Mean log odds above which fine pieces become parts."""
     steps: tuple[float, ...] = (3.5, 2.5, 1.5)
-    """Mean log odds above which parts are joined before what they make up is judged anew, one step after the other."""
+    """Mean log odds above which parts are joined before the merged parts are scored again, one step after the other."""
     enough: float = 0.0
-    """Mean log odds above which parts become things."""
+    """Mean log odds above which parts become objects."""
     hop_m: float = 0.05
-    """Longest gap over which voxels of no piece go to the thing that is nearest."""
+    """Longest gap over which voxels of no piece go to the object that is nearest."""
 
 
 @dataclass(frozen=True)
 class CloudCut:
-    """T things of a cloud of N voxels."""
+    """T objects of a cloud of N voxels."""
 
     labels: NDArray[np.int32]
-    """Thing of each voxel, from 0; -1 for none. Shape (N,)."""
+    """Object of each voxel, from 0; -1 for none. Shape (N,)."""
     verdicts: SegmentVerdicts
 
     def only(self, kept: NDArray[np.bool_]) -> CloudCut:
-        """Return the cut with only the things that are `kept` (T,); the voxels of the others are of none."""
+        """Return the cut with only the objects that are `kept` (T,); the voxels of the others are of none."""
         number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
         return CloudCut(np.asarray(number[self.labels], np.int32), self.verdicts.rows(np.flatnonzero(kept)))
 
 
 def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | None = None) -> CloudCut:
-    """Cut a cloud into things."""
+    """Cut a cloud into objects."""
     s = settings or CutSettings()
     parts, graph, scores = join_parts(surface, cut_pieces(surface), weights, s)
     own = agglomerate(len(graph.nodes), graph.left, graph.right, scores.affinity, graph.weight, s.enough)
@@ -58,10 +58,10 @@ def cut_cloud(surface: ChunkSurface, weights: Weights, settings: CutSettings | N
 def join_parts(
     surface: ChunkSurface, pieces: Pieces, weights: Weights, s: CutSettings
 ) -> tuple[NDArray[np.int32], PieceGraph, Classification]:
-    """Return the part of each voxel (N,), -1 for none, the parts' graph, and what the second network says of it.
+    """Return the part of each voxel (N,), -1 for none, the parts' graph, and the second network's scores of it.
 
-    Only what is surely one is joined at a time; then size, place and borders of what came of it are measured again, so
-    that no early join is decided by small pieces that could not yet tell.
+    Only confident joins are made at a time; then size, place and borders of the results are measured again, so that
+    small pieces without evidence decide no early join.
     """
     g, scores = pieces.graph, classify(weights, "fine", pieces.graph)
     own = agglomerate(len(g.nodes), g.left, g.right, scores.affinity, g.weight, s.sure)
@@ -74,10 +74,10 @@ def join_parts(
 
 
 def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: float) -> NDArray[np.int32]:
-    """Return labels (N,) in which points of none (-1) have that of the nearest, by ways without a gap above `hop`.
+    """Return labels (N,) in which unlabelled points (-1) get the nearest label by paths without a gap above `hop`.
 
-    Sides that are seen at a grazing angle are too thin for pieces, but how deep a thing is, nothing else tells. Gaps
-    count squared, so that ways keep to where points are dense. `points` has shape (N, 3).
+    Sides seen at a grazing angle are too sparse for pieces, but only they show an object's depth. Gaps count squared,
+    so that paths prefer dense points. `points` has shape (N, 3).
     """
     free, taken = np.flatnonzero(labels < 0), np.flatnonzero(labels >= 0)
     if not len(free) or not len(taken):
@@ -103,7 +103,7 @@ def spread_labels(points: NDArray[np.floating], labels: NDArray[np.int32], hop: 
 def group(
     surface: ChunkSurface, pieces: Pieces, scores: Classification, own: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], PieceGraph]:
-    """Return the group of each voxel (N,), -1 for none, and the groups' graph with what the first network said.
+    """Return the group of each voxel (N,), -1 for none, and the groups' graph with the first network's outputs.
 
     `own` is the group of each piece, from 0. Shape (P,).
     """
@@ -124,11 +124,11 @@ def group(
 
 
 FAR = 3
-"""Doublings of the voxel's size at which parts are neighbours: legs end up to 16 cm below what they carry, where a view
-from above hides their top."""
+"""Doublings of the voxel's size at which parts are neighbours: a view from above hides up to 16 cm between a leg and
+its table top."""
 EXTRA_NODES = 2
-"""Columns that `group` adds to the features of pieces besides those of the first network's hidden state: structure and
-number of pieces."""
+"""Columns that `group` adds to the features of pieces besides the first network's hidden state: structure and number of
+pieces."""
 EXTRA_EDGES = 4
 
 

@@ -1,4 +1,4 @@
-"""The chunk's cloud cut into small pieces that no border of a thing runs through."""
+"""The chunk's cloud cut into small pieces that no border of an object runs through."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from list3r.instances.learned.kernels import way_costs
 
 @dataclass(frozen=True)
 class SuperpointSettings:
-    """How fine the pieces are, and what they keep to."""
+    """Size of the pieces, and the borders they respect."""
 
     seed_m: float = 0.06
     """Spacing of the seeds from which pieces grow."""

@@ -1,4 +1,4 @@
-"""What clusters of parts are as wholes: structure, names, and whether a person would call each one thing."""
+"""Classification of clusters of parts: structure, names, and whether each is one whole object."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ Float = NDArray[np.float32]
 
 
 SHOWN_NODES = (2, 3, 4, *range(16, 26))
-"""Columns of the features of parts whose means verdicts are told from: slopes, colours, noise, what is before it."""
+"""Columns of the parts' features that are averaged for the classifier: slopes, colours, noise, occluders."""
 NODES_AT = 19
-"""Column of the first of them among the features of things."""
+"""Column of the first of them among the features of objects."""
 
 
 @dataclass(frozen=True)
 class SegmentVerdicts:
-    """What is said of T things."""
+    """Classification of T clusters."""
 
     structure: Float
-    """Probability that a thing is of what bounds the room. Shape (T,)."""
+    """Probability that it bounds the room. Shape (T,)."""
     whole: Float
-    """Calibrated probability that it is one thing and all of it. Shape (T,)."""
+    """Calibrated probability that it is one object and all of it. Shape (T,)."""
     names: Float
     """Calibrated probabilities of the names, see `names_of`. Shape (T, C)."""
 
     def rows(self, rows: NDArray[np.int64]) -> SegmentVerdicts:
-        """Return what is said of some things, in their order. `rows` has shape (R,)."""
+        """Return the verdicts of some clusters, in their order. `rows` has shape (R,)."""
         return SegmentVerdicts(self.structure[rows], self.whole[rows], self.names[rows])
 
 
@@ -73,7 +73,7 @@ def first_verdicts(weights: Weights, x: NDArray[np.float32]) -> tuple[NDArray[np
 def segment_features(
     own: NDArray[np.int64], graph: PieceGraph, scores: Classification
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return how probably each cluster is structure (T,), and what verdicts are told from (T, F)."""
+    """Return the probability that each cluster is structure (T,), and the classifier's inputs (T, F)."""
     count, size = int(own.max(initial=-1)) + 1, graph.moments[:, 0].astype(np.float64)
     total = np.maximum(np.bincount(own, size, minlength=count), 1.0)
 

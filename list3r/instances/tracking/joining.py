@@ -1,4 +1,4 @@
-"""Candidates of several anchors that are views of one thing."""
+"""Candidates of several anchors that are views of one object."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from list3r.instances.geometric.kernels import propagate_labels
 from list3r.instances.geometric.views import ChunkViews
 
 MIN_OVERLAP = 0.4
-"""Overlap over union, of what both anchors see, from which two candidates are taken for one thing."""
+"""IoU, over the surface that both anchors see, from which two candidates are one object."""
 
 
 def join_candidates(views: ChunkViews, proposals: Sequence[Proposals]) -> list[NDArray[np.int64]]:

@@ -1,4 +1,4 @@
-"""What is too seldom one thing to be listed, kept as it is seen on the anchors."""
+"""Low-confidence segments: not listed, kept as seen on the anchors."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ from list3r.memory.records import LocalInstance
 def low_confidence_instances(
     views: ChunkViews, proposals: Sequence[Proposals], settings: InstanceSettings, first_id: int
 ) -> tuple[LocalInstance, ...]:
-    """Return the scraps of a chunk, with local ids from `first_id` on; a discoverer tells them by `identity`.
-
-    They are seen on anchors alone: what is not listed is not worth following from frame to frame.
+    """Return the low-confidence segments of a chunk, with local ids from `first_id` on, grouped by `identity`. They are
+    seen on anchors alone: tracking them from frame to frame is not worth the time.
     """
     numbered = [(p, identity_of(p)) for p in proposals if len(p.score)]
     if not numbered:
@@ -44,6 +43,6 @@ def low_confidence_instances(
 
 
 def identity_of(proposals: Proposals) -> NDArray[np.int64]:
-    """Return the thing that each candidate is a view of, which its discoverer must know. Shape (N,)."""
+    """Return the object that each candidate is a view of, which its discoverer must know. Shape (N,)."""
     assert proposals.identity is not None
     return proposals.identity

@@ -1,4 +1,4 @@
-"""All solids of a scene, some of which move, and where they can show in a picture."""
+"""All solids of a scene, fixed and moving, and where they can appear in a picture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 
 
 
 class SolidScene:
-    """The solids of things that stand still and of things that are put elsewhere from frame to frame."""
+    """The solids of objects that are still and of objects that are put elsewhere from frame to frame."""
 
     def __init__(self, objects: Sequence[SimulatedObject], moving: Sequence[SimulatedObject] = ()) -> None:
         self.solids = stack_solids((*objects, *moving))
@@ -26,7 +26,7 @@ class SolidScene:
         self._own = {t.id: (np.flatnonzero(self.solids.object_id == t.id), stack_solids([t])) for t in moving}
 
     def place(self, object_id: int, T_world_object: Array) -> None:
-        """Put one of the moving things somewhere, upright; it is made at the origin. `T_world_object` (4, 4)."""
+        """Put one of the moving objects somewhere, upright; it is made at the origin. `T_world_object` (4, 4)."""
         rows, home = self._own[object_id]
         rotation, position = T_world_object[:3, :3], T_world_object[:3, 3]
         self.solids.center[rows] = home.center @ rotation.T + position

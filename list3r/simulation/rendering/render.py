@@ -1,4 +1,4 @@
-"""Ray casting of a world: colour, depth and ids of what each pixel shows."""
+"""Ray casting of a world: colour, depth and object id of each pixel."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _SUBPIXELS = np.array([[-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.12
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """What a perfect camera sees."""
+    """The image of a perfect camera."""
 
     color: Floats
     """RGB in [0, 255]. Shape (H, W, 3)."""
     depth: Floats
     """Along the camera's z, metres, 0 where nothing is hit. Shape (H, W)."""
     ids: NDArray[np.int32]
-    """Id of the thing, 0 for nothing. Shape (H, W)."""
+    """Id of the object, 0 for nothing. Shape (H, W)."""
     incidence: Floats
     """Cosine between the ray and the surface's normal, in [0, 1]. Shape (H, W)."""
 
@@ -38,7 +38,7 @@ class RenderedFrame:
 class Renderer:
     """Draws a world with one camera. Solids are culled by the rectangle of their corners and drawn near to far.
 
-    Things in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
+    Objects in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
     """
 
     def __init__(

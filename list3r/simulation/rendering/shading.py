@@ -1,4 +1,4 @@
-"""Light and surfaces: what colour the visible points of a world have."""
+"""Light and surfaces: the colours of the visible points of a world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Lighting:
-    """What lights the rooms."""
+    """The lamps of the rooms."""
 
     sky: float = 0.5
     """Light from everywhere, such as by day through windows."""
@@ -49,7 +49,7 @@ class TextureAtlas:
         self._tile_m = np.array([material.tile_m for material in solids.materials], np.float32)
 
     def sample(self, material: NDArray[np.int64], u_m: Floats, v_m: Floats, footprint_m: Floats) -> Floats:
-        """Colour at surface coordinates in metres, bilinear in the level whose texel is the pixel's footprint.
+        """Colour at surface coordinates in metres, bilinear in the mip level that matches the pixel's footprint.
 
         All arguments have shape (N,); the result (N, 3), RGB in [0, 255].
         """
@@ -79,7 +79,7 @@ class TextureAtlas:
 
 
 class ContactShadows:
-    """Soft darkness on floors and table tops under and beside what stands on them or hangs low above them."""
+    """Soft darkness on floors and table tops under and around objects on them or low above them."""
 
     def __init__(self, world: SimulatedWorld, solids: Solids) -> None:
         supports = {t.support for t in world.objects if t.support is not None and t.container is None}

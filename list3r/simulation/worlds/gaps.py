@@ -1,4 +1,4 @@
-"""Distances between things of a simulated world, from their true shapes."""
+"""Distances between objects of a simulated world, from their true shapes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from list3r.simulation.worlds.objects import BOX, SPHERE, Part, SimulatedObject
 Array = NDArray[np.float64]
 
 _SLICES = 33
-"""Discs that stand for a sphere: they lie within a hundredth of its radius of it."""
+"""Discs that represent a sphere: they are within a hundredth of its radius of it."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class _Slabs:
 
 
 def surface_gap(a: SimulatedObject, b: SimulatedObject) -> float:
-    """Distance between the surfaces of two things, metres, 0 where they touch or reach into each other.
+    """Distance between the surfaces of two objects, metres, 0 where they touch or reach into each other.
 
     Exact for boxes and cylinders, to a few tenths of a millimetre for spheres; open vessels count as full.
     """
@@ -48,7 +48,7 @@ def _slabs(obj: SimulatedObject) -> _Slabs:
 
 
 def _rows(part: Part) -> list[tuple[Array, float, float, float]]:
-    """(corners (4, 2), radius, low, high) of the slabs of a part, in the frame of its thing."""
+    """(corners (4, 2), radius, low, high) of the slabs of a part, in the frame of its object."""
     x, y, z = part.center
     hx, hy, hz = part.half
     if part.kind == BOX:

@@ -1,4 +1,4 @@
-"""Where things stand: two furnished rooms in their own coordinates, with seeded sizes, colours and small things."""
+"""Where objects are: two furnished rooms in their own coordinates, with seeded sizes, colours and small objects."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Room:
 
 @dataclass
 class Placer:
-    """Collects things with rising ids, in room coordinates."""
+    """Collects objects with rising ids, in room coordinates."""
 
     rng: np.random.Generator
     objects: list[SimulatedObject] = field(default_factory=list)
@@ -73,7 +73,7 @@ class Placer:
         inside: int | None = None,
         attached: int | None = None,
     ) -> SimulatedObject:
-        """Put a thing at (x, y) of a room; `yaw_deg` turns its front from the room's +y."""
+        """Put an object at (x, y) of a room; `yaw_deg` turns its front from the room's +y."""
         yaw = np.deg2rad(180.0 - yaw_deg if room.mirrored else yaw_deg)
         wx, wy = room.world_xy(x, y)
         obj = SimulatedObject(len(self.objects) + 1, label, parts, (wx, wy, z), float(yaw), on, inside, attached)
@@ -81,7 +81,7 @@ class Placer:
         return obj
 
     def add_structure(self, label: str, parts: f.Parts) -> SimulatedObject:
-        """Return a floor, wall or ceiling, whose parts are in world coordinates."""
+        """Return a floor, wall or ceiling, its parts in world coordinates."""
         obj = SimulatedObject(len(self.objects) + 1, label, parts, (0.0, 0.0, 0.0), structure=label)
         self.objects.append(obj)
         return obj
@@ -97,12 +97,12 @@ class Placer:
         return Material(kind, low, high, 0.6, int(self.rng.integers(1 << 16)))
 
     def bright(self, kind: str, tile_m: float) -> Material:
-        """Return a vivid surface for small things."""
+        """Return a vivid surface for small objects."""
         low, high = BRIGHT[self.rng.integers(len(BRIGHT))]
         return Material(kind, low, high, tile_m, int(self.rng.integers(1 << 16)))
 
     def small(self, kind: str) -> tuple[f.Parts, float]:
-        """Return the parts of a small thing and the radius that it takes up, metres."""
+        """Return the parts of a small object and the radius that it takes up, metres."""
         rng = self.rng
         if kind == "mug":
             radius = rng.uniform(0.042, 0.05)
@@ -133,7 +133,7 @@ class Placer:
         depth: float,
         keep_xy: float = 0.0,
     ) -> list[SimulatedObject]:
-        """Small things on the top of `support` at least 5 cm apart; the back `keep_xy` metres stay free."""
+        """Small objects on the top of `support` at least 5 cm apart; the back `keep_xy` metres stay free."""
         top = support.box().center[2] + support.box().size[2] / 2
         placed: list[tuple[float, float, float]] = []
         out = []

@@ -1,4 +1,4 @@
-"""What is true of a world, in words that a scene graph can be held against."""
+"""Ground truth of a world, in the terms of a scene graph."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.world import SimulatedWorld
 
 NEXT_TO_M = (0.1, 0.4)
-"""Things are next to each other up to half the mean of their longest edges, within these bounds, metres."""
+"""Objects are next to each other up to half the mean of their longest edges, within these bounds, metres."""
 NEAR_M = (0.15, 0.4)
-"""The same for things that are near each other, in any direction."""
+"""The same for objects that are near each other, in any direction."""
 SHARED_HEIGHT = 0.3
-"""Least share of the shorter one's height that two things side by side have in common."""
+"""Least share of the shorter one's height that two objects side by side have in common."""
 
 
 def world_truth(world: SimulatedWorld, seen: dict[int, dict[str, int]] | None = None) -> dict[str, Any]:
     """Return the content of `truth.json`: frame, instances with boxes, relations.
 
-    `seen` maps the id of a thing to counts of the walk: frames in which it shows, and its largest area in pixels.
+    `seen` maps the id of an object to counts of the walk: frames in which it shows, and its largest area in pixels.
     """
     return {
         "format": "list3r-simulated-truth",
@@ -58,8 +58,8 @@ def _instance(obj: SimulatedObject, seen: dict[str, int]) -> dict[str, Any]:
 def true_relations(world: SimulatedWorld) -> list[tuple[int, str, int]]:
     """Triples (subject, predicate, object): `on`, `in`, `attached_to` by construction, `near` and `next_to` both ways.
 
-    `near` is the gap between surfaces against the size of the two, among things of which neither holds the other;
-    `next_to` the same among those that share heights. Rugs are next to nothing: what touches them stands on them.
+    `near` is the gap between surfaces against the size of the two, among pairs where neither contains the other;
+    `next_to` the same for pairs at shared heights. Rugs are next to nothing: objects that touch them are on them.
     """
     triples: list[tuple[int, str, int]] = []
     for obj in world.objects:
@@ -78,7 +78,7 @@ def true_relations(world: SimulatedWorld) -> list[tuple[int, str, int]]:
 
 
 def _close(a: SimulatedObject, b: SimulatedObject) -> list[str]:
-    """Return which of near and next_to two things are."""
+    """Return which of near and next_to two objects are."""
     if a.id in (b.support, b.container) or b.id in (a.support, a.container):
         return []
     one, two = a.box(), b.box()

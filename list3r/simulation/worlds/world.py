@@ -19,7 +19,7 @@ HEIGHT_M = 2.5
 
 @dataclass(frozen=True)
 class Stop:
-    """Where the walker's head is and what it looks at, world, metres."""
+    """The camera's position and the point it looks at, world, metres."""
 
     eye: Vec3
     target: Vec3
@@ -27,7 +27,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class SimulatedWorld:
-    """Rooms, things, lamps, and a way through."""
+    """Rooms, objects, lamps, and a way through."""
 
     seed: int
     rooms: tuple[Room, ...]
@@ -36,12 +36,12 @@ class SimulatedWorld:
     """A round through both rooms that comes back to where it starts."""
 
     def object_of(self, object_id: int) -> SimulatedObject:
-        """Return the thing of an id. Raises `KeyError`."""
+        """Return the object of an id. Raises `KeyError`."""
         return {t.id: t for t in self.objects}[object_id]
 
 
 def make_world(seed: int = 0) -> SimulatedWorld:
-    """Return the world of a seed: sizes, colours, mirroring and small things are drawn from it."""
+    """Return the world of a seed: sizes, colours, mirroring and small objects are drawn from it."""
     rng = np.random.default_rng([seed, 1])
     depth = 3.8
     living = Room(0.0, 4.0, depth, bool(rng.integers(2)))
