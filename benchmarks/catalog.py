@@ -87,10 +87,10 @@ class Growth:
     def __init__(self, url: str, server: PostgresServer | None, asked: argparse.Namespace) -> None:
         self._url, self._server, self._asked = url, server, asked
         self._chance = np.random.default_rng(1)
-        self._looks = {
-            name.format(asked.dimension): Looks(asked.dimension, *how, self._chance) for name, how in SPACES.items()
+        self._clusters = {
+            name.format(asked.dimension): Clusters(asked.dimension, *how, self._chance) for name, how in SPACES.items()
         }
-        self._space, self._even, self._lone = self._looks
+        self._space, self._even, self._lone = self._clusters
         self._vectors: list[list[Vectors]] = []
         self._backend = open_backend(url)
         self._catalog = Catalog(self._backend)
@@ -124,7 +124,7 @@ class Growth:
         with _spent(server) as spent, self._catalog.loading(missing):
             for n in range(len(self._vectors), count):
                 began = time.process_time()
-                content = make_content(f"m{n:05d}", self._asked.instances, self._looks, self._chance)
+                content = make_content(f"m{n:05d}", self._asked.instances, self._clusters, self._chance)
                 made += time.process_time() - began
                 self._vectors.append([held.vectors.astype(np.float16) for held in content.spaces])
                 self._backend.put(content)
@@ -142,8 +142,8 @@ class Growth:
 
     def _put(self, server: int) -> dict[str, float]:
         """Add a memory of 1,000 three times, each of other objects."""
-        looks = {self._space: self._looks[self._space]}
-        contents = [make_content(f"small{n}", 1000, looks, self._chance) for n in range(3)]
+        clusters = {self._space: self._clusters[self._space]}
+        contents = [make_content(f"small{n}", 1000, clusters, self._chance) for n in range(3)]
         found = _timed(lambda n: self._backend.put(contents[n]), 3, server, warm=0)
         for content in contents:
             self._backend.drop(content.entry.name)
@@ -174,11 +174,11 @@ class Growth:
         }
 
     def _alike(self, space: str, n: int) -> CatalogAnswers:
-        return self._catalog.similar(vector=self._looks[space].near(n), space=space, k=10)
+        return self._catalog.similar(vector=self._clusters[space].near(n), space=space, k=10)
 
     def _recall(self, space: str, number: int) -> float:
         """Share of the true ten that are found, over 50 questions."""
-        size, queries = self._asked.instances, np.array([self._looks[space].near(n) for n in range(50)])
+        size, queries = self._asked.instances, np.array([self._clusters[space].near(n) for n in range(50)])
         cosine = np.concatenate([queries @ v[number].astype(np.float32).T for v in self._vectors], axis=1)
         hits = 0
         for n, best in enumerate(np.argpartition(-cosine, 10, axis=1)[:, :10].tolist()):
@@ -235,7 +235,7 @@ class Growth:
                 began = time.perf_counter()
                 try:
                     if writes:
-                        backend.put(make_content(f"busy{number}", 200, self._looks, chance))
+                        backend.put(make_content(f"busy{number}", 200, self._clusters, chance))
                     else:
                         self._one(Catalog(backend), chance)
                 except Exception as error:
@@ -260,7 +260,7 @@ class Growth:
         n = int(chance.integers(1_000_000))
         near = catalog.nearest(self._name(n), point=chance.uniform(0, 10, 3), k=10)
         named = catalog.find(KINDS[n % 400], k=10)
-        alike = catalog.similar(vector=self._looks[self._space].near(n), space=self._space, k=10)
+        alike = catalog.similar(vector=self._clusters[self._space].near(n), space=self._space, k=10)
         if len(near) != 10 or not named or len(alike) != 10:
             raise CatalogError(f"answers are missing: {len(near)}, {len(named)}, {len(alike)}")
 
@@ -274,7 +274,7 @@ class Growth:
             return [*near, *alike, self._catalog.memories()]
 
         before, said = answers(), list[str]()
-        content = make_content("cut off", 20_000, self._looks, self._chance)
+        content = make_content("cut off", 20_000, self._clusters, self._chance)
 
         def write() -> None:
             backend = open_backend(self._url)
@@ -321,7 +321,7 @@ class Growth:
         return f"m{n * 7919 % len(self._vectors):05d}"
 
 
-class Looks:
+class Clusters:
     """Vectors of one space: objects in clusters of appearance, or each by itself without clusters."""
 
     def __init__(self, dimension: int, decay: float, kinds: int, chance: np.random.Generator) -> None:
@@ -342,7 +342,7 @@ class Looks:
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
 
 
-def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.random.Generator) -> MemoryContent:
+def make_content(name: str, count: int, clusters: dict[str, Clusters], chance: np.random.Generator) -> MemoryContent:
     """A memory of objects with random places, names, appearances and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
@@ -359,7 +359,7 @@ def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.rand
     entry = MemoryEntry(
         name, f"/nowhere/{name}.l3r", 0, f"{chance.integers(2**60):x}", 1, 0, "metric", "known", count, 1
     )
-    spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in looks.items()]
+    spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in clusters.items()]
     return MemoryContent(entry, instances, relations, spaces)
 
 

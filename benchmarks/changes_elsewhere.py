@@ -106,7 +106,7 @@ def drawn(
     free = [k for k, e in extents.items() if largest[k] >= LEAST_PX and _can_be_carried(k, e, extents)]
     order = [free[n] for n in rng.permutation(len(free)).tolist()]
     removed, added, moved = order[0::3][:EACH], order[1::3][:EACH], {}
-    for k in (k for k in order if k not in removed and k not in added and _stands(k, extents)):
+    for k in (k for k in order if k not in removed and k not in added and _is_supported(k, extents)):
         others = {n: e for n, e in extents.items() if n != k and n not in removed}
         shift = _shift(k, extents[k], others, moved, probe, rng)
         if shift is not None and len(moved) < EACH:
@@ -123,7 +123,7 @@ def _can_be_carried(k: int, extent: Array, extents: Mapping[int, Array]) -> bool
     return not any(inside[n] and low[2] + 0.02 < extents[n][0, 2] < high[2] + 0.05 for n in middle)
 
 
-def _stands(k: int, extents: Mapping[int, Array]) -> bool:
+def _is_supported(k: int, extents: Mapping[int, Array]) -> bool:
     others = {n: e for n, e in extents.items() if n != k}
     return bool(extents[k][0, 2] < 0.05) or _support(extents[k], others) is not None
 

@@ -323,8 +323,7 @@ def _by_masks(
 def _false_objects(
     overlaps: Overlaps, columns: list[int], found: list[tuple[int, int, float]], truth: Mapping[str, Any]
 ) -> dict[str, int]:
-    """How many objects that match nothing are mostly on structure, on an object that is found, and on one that is
-    not."""
+    """Numbers of unmatched objects mostly on structure, on a found object, and on a missed one."""
     structure = {e["id"] for e in truth["instances"] if e["structure"]}
     matched, known = {e for _, e, _ in found}, {t for t, _, _ in found}
     out = {"false_on_structure": 0, "false_on_found": 0, "false_on_missed": 0}

@@ -107,11 +107,11 @@ def main() -> None:
             if k >= len(chosen.memory):
                 run_list3r("build", chosen.source, "-m", str(built), "--reconstruction", kind)
             for detector in chosen.detectors:
-                for looks in ("video", "pictures"):
+                for using in ("video", "pictures"):
                     shutil.copy(built, work)
-                    where = ["--source", chosen.source] if looks == "video" else []
+                    where = ["--source", chosen.source] if using == "video" else []
                     said, _ = run_list3r("detect", str(work), "--detector", str(detector), *where)
-                    row = {"reconstruction": kind, "detector": detector.stem, "looks": looks, "frames": said["frames"]}
+                    row = {"reconstruction": kind, "detector": detector.stem, "looks": using, "frames": said["frames"]}
                     rows.append({**row, **judged(work)})
                     print({k: v for k, v in rows[-1].items() if k != "called"}, flush=True)
     if chosen.json:

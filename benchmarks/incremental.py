@@ -189,8 +189,7 @@ def edited(store: Store) -> tuple[float, float]:
 
 
 def again(start: int, turn: int, name: str, seed: int, session: int = 2) -> ChunkResult:
-    """Chunk `turn` of a later session, which sees the scene of the first one from chunk `start` on, with other
-    errors."""
+    """Chunk `turn` of a later session: the scene of the first one from chunk `start` on, with other errors."""
     made = chunk(start + turn, name, seed)
     rng = np.random.default_rng([seed, 8, turn, session])
     off = rng.normal(0.0, 0.003, 3)

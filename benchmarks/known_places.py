@@ -26,7 +26,7 @@ _INSIDE = 0.3
 """Search radius round an object's centre, as a share of its size."""
 _GRID = np.array(list(product((-_INSIDE, 0.0, _INSIDE), repeat=3)))
 
-Thing = dict[str, Any]
+Entry = dict[str, Any]
 Changes = set[tuple[str, int]]
 
 
@@ -34,9 +34,9 @@ class KnownPlaces:
     """Where the camera last saw objects, visit by visit."""
 
     def __init__(self, walks: Sequence[Path]) -> None:
-        self.scenes = [_things(walk) for walk in walks]
+        self.scenes = [_entries(walk) for walk in walks]
         self._visits = [_Visit(walk) for walk in walks]
-        self.known: list[dict[int, Thing]] = []
+        self.known: list[dict[int, Entry]] = []
         """By visit: the objects by id where they were last seen, without those with places seen empty since."""
         self.changes: list[Changes] = []
         """By visit: kind and id of changes that it could be the first to see."""
@@ -63,13 +63,13 @@ class KnownPlaces:
         out |= {(kind, t) for k, t in out if k == "moved" for kind in ("removed", "added")}
         return out - self.changes[n]
 
-    def _changes(self, n: int, before: dict[int, Thing], now: dict[int, Thing]) -> Changes:
+    def _changes(self, n: int, before: dict[int, Entry], now: dict[int, Entry]) -> Changes:
         found = _differences(before, now) if n else set()
         known = {t for places in self.known[:n] for t in places}
         came = {t for k, t in found if k == "added" and t not in known}
         return found - {("added", t) for t in came if not any(v.sees_empty(now[t]) for v in self._visits[:n])}
 
-    def _empty(self, n: int, obj: Thing) -> bool:
+    def _empty(self, n: int, obj: Entry) -> bool:
         """Whether a visit sees that an object is not where it was: the place is empty, or something else has it."""
         if self._visits[n].sees_empty(obj):
             return True
@@ -89,12 +89,12 @@ class _Visit:
         ]
         self._camera = np.loadtxt(walk / "calibration.txt").reshape(-1)[:4]
 
-    def sees_empty(self, obj: Thing) -> bool:
+    def sees_empty(self, obj: Entry) -> bool:
         """Whether frames see through the place of an object."""
         seen = sum(self._sees_through(obj, T, depth) for T, depth in self._frames)
         return seen >= _LEAST_FRAMES
 
-    def _sees_through(self, obj: Thing, T_cam_world: NDArray[np.float64], depth: NDArray[np.float32]) -> bool:
+    def _sees_through(self, obj: Entry, T_cam_world: NDArray[np.float64], depth: NDArray[np.float32]) -> bool:
         fx, fy, cx, cy = self._camera
         center, size = (np.array(obj["box"][k]) for k in ("center", "size"))
         turned = Rotation.from_quat(obj["box"]["quat_wxyz"], scalar_first=True)
@@ -109,11 +109,11 @@ class _Visit:
         return float(np.mean(depth[v, u] > p[:, 2] + _BEHIND_M)) >= _LEAST_SHARE
 
 
-def _things(walk: Path) -> dict[int, Thing]:
+def _entries(walk: Path) -> dict[int, Entry]:
     return {e["id"]: e for e in read_scene(walk / "truth.json")["instances"] if not e["structure"]}
 
 
-def _differences(before: dict[int, Thing], now: dict[int, Thing]) -> Changes:
+def _differences(before: dict[int, Entry], now: dict[int, Entry]) -> Changes:
     moved = {("moved", t) for t in before.keys() & now.keys() if is_elsewhere(before[t], now[t])}
     return (
         moved

@@ -105,7 +105,7 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
         on_walls = {k: v for k, v in truth_of.items() if v in kept}
         attached = evaluate_relations(_relations(walk), claimed, on_walls, ("attached_to",)).total
         near = {(s, o) for s, p, o in true if p == "near"}
-        told_when_asked = asked(store, WalkSettings(seed=seed), matched, near)
+        derived = asked(store, WalkSettings(seed=seed), matched, near)
         with store.transaction():
             store.facts.gravity = "unknown"
         vertical = _vertical_without_gravity(store)
@@ -114,14 +114,14 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
         row[name] = {"true": entry.true_count, "claimed": entry.estimated_count, "correct": entry.correct}
     names = {i: f"{e['label']}#{i}" for i, e in truth.items()}
     close = _close_calls(seed)
-    beside = {(s, o) for s, p, o in true if p == "next_to"} - close
+    neighbours = {(s, o) for s, p, o in true if p == "next_to"} - close
     wrong = {(s, o) for s, p, o in errors.wrong if p == "next_to"} - close
     missed = {(s, o) for s, p, o in errors.missed if p == "next_to"} - close
-    counted = {pair for pair in beside if set(pair) <= set(matched.values())}
+    counted = {pair for pair in neighbours if set(pair) <= set(matched.values())}
     correct = len(counted) - len(missed)
     row["attached_to"] = {"true": attached.true_count, "claimed": attached.estimated_count, "correct": attached.correct}
     for name in ASKED:
-        row[name] = {k: told_when_asked[f"{name}_{k}"] for k in ("true", "claimed", "correct")}
+        row[name] = {k: derived[f"{name}_{k}"] for k in ("true", "claimed", "correct")}
     row["next_to_decided"] = {"true": len(counted), "claimed": correct + len(wrong), "correct": correct}
     row["wrong"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.wrong]
     row["missed"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.missed]

@@ -122,7 +122,7 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
 
     row |= timed("similar", [lambda n=n: ask(n) for n in range(len(asked))])
     row["resident_mb"] = resident_mb()
-    row |= beside(store, points, asked, found, database=database)
+    row |= peers(store, points, asked, found, database=database)
     row |= timed("one_more_chunk", [lambda n=n: one_more_chunk(store, int(n), count) for n in range(20)], warm=1)
     row |= timed("similar_after_chunk", [lambda v=v: similar(store, vector=v, space=SPACE, k=10) for v in asked[:20]])
     store.close()
@@ -166,7 +166,7 @@ def leave_cache(path: Path) -> None:
         os.close(file)
 
 
-# ---------------------------------------------------------------------------------------------- what is written
+# -------------------------------------------------------------------------------------------------- writes
 
 
 def rooms(count: int) -> Floats:
@@ -272,10 +272,10 @@ def one_more_chunk(store: Store, n: int, count: int) -> None:
         store.relations.replace(changed, [Relation(a, "near", a - 1, 0.9, 0.1) for a in changed[1:]])
 
 
-# ---------------------------------------------------------------------------------------------- beside it
+# -------------------------------------------------------------------------------------------------- peers
 
 
-def beside(
+def peers(
     store: Store, points: Floats, asked: NDArray[np.float32], found: dict[int, list[int]], *, database: bool
 ) -> dict[str, Any]:
     """A plain NumPy scan over the same data, which is also the truth for the recall, and a vector database."""

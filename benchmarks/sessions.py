@@ -153,12 +153,12 @@ def measure(before: Store, after: Store, walks: Sequence[Path], due: Due | None 
         "missed": sorted((k, t, t in known) for k, t in done - claimed),
         "false": wrong,
         "false_removed_unseen": sum(k == "removed" and _unseen(scenes[1], t) for k, t in wrong),
-        "first": things_found(first),
-        "last": things_found(second),
+        "first": objects_found(first),
+        "last": objects_found(second),
     }
 
 
-def things_found(found: dict[str, Any]) -> dict[str, Any]:
+def objects_found(found: dict[str, Any]) -> dict[str, Any]:
     """Objects and relations after a session: counts."""
     names = ("true_count", "estimated_count", "matched", "duplicates", "merged_pairs")
     out: dict[str, Any] = {k: {n: found[f"instances_{k}"][n] for n in names} for k in ("0.25", "0.50")}

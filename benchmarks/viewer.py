@@ -74,7 +74,7 @@ def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, An
     page.wait(lambda: "Click an object, or search for one." in page.text(), 300)
     page.wait(viewer.server.get_clients, 300)
     loaded = time.monotonic() - began
-    page.wait(lambda: [p for p in viewer._pages.values() if p.settled], 300)
+    page.wait(lambda: [p for p in viewer._pages.values() if p.at_rest], 300)
     (points,) = viewer._pages.values()
     report = {"load_s": round(loaded, 1), "shown_s": round(time.monotonic() - began, 1)}
     report |= {"page_draws_points_a_s": round(1 / (points.seconds_a_point or 1e-9)), "at_rest": drawn(points, "/fine/")}

@@ -45,14 +45,14 @@ def compare_walks(args: argparse.Namespace) -> None:
             )
             folder = root / f"{'hard' if args.hard else 'wide'}-{seed}-{args.frames}"
             rows.append({"walk": f"seed {seed}", **_simulated(folder, walk, args)})
-            _tell(rows, args)
+            _report(rows, args)
         if args.real is not None:
             rows.append({"walk": f"{args.real.name}, every {REAL_EVERY}th", **_real(root / "wide-real", args)})
-            _tell(rows, args)
+            _report(rows, args)
     print(machine())
 
 
-def _tell(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
+def _report(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
     print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
     said = {"step_m": args.step, "hard": args.hard, "frames": args.frames, "size": SIZE}
     write_json(args.json, {**said, "walks": rows})

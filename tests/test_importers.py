@@ -157,7 +157,7 @@ def test_older_boxes_and_names_of_spark_dsg_are_read(tmp_path: Path) -> None:
             "ends",
         ),
         ("cloud.ply", b"PLY", "not a PLY"),
-        ("dsg.json", b'{"nodes": [], "layer_ids": []}', "holds no things"),
+        ("dsg.json", b'{"nodes": [], "layer_ids": []}', "holds no objects"),
         ("other.json", b'{"a": 1}', "not a map of"),
     ],
 )

@@ -260,7 +260,7 @@ def test_descriptors_know_a_place_again_and_confuse_twins(twins: SimulatedVideo)
 def test_twins_have_like_features(twins: SimulatedVideo) -> None:
     looks = Appearance(twins, 32, 0.6, 0.25)
     unit = looks.full[1:] / np.linalg.norm(looks.full[1:], axis=1, keepdims=True)
-    cosine, kind = unit @ unit.T, looks.looks[1:]
+    cosine, kind = unit @ unit.T, looks.classes[1:]
     twin = (kind[:, None] == kind) & ~np.eye(len(kind), dtype=bool)
     assert twin.any() and cosine[twin].min() > 0.8
     assert np.quantile(cosine[kind[:, None] != kind], 0.99) < 0.75

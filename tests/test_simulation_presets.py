@@ -112,7 +112,7 @@ def test_the_building_is_closed_and_the_camera_in_the_open(preset: str) -> None:
     assert film.depth.shape == film.ids.shape == (len(film.time_s), 24, 32)
     known = {t.id for t in film.world.objects} | {m.id for m in film.movers}
     assert len(known) == len(film.world.objects) + len(film.movers)
-    assert set(np.unique(film.ids).tolist()) <= known == set(film.looks)
+    assert set(np.unique(film.ids).tolist()) <= known == set(film.classes)
 
 
 def test_points_of_pixels_lie_on_their_things() -> None:
@@ -172,7 +172,7 @@ def test_twins_look_alike_and_are_two_places() -> None:
     film, house = video("twins"), shot("twins").building
     rooms = [room for room in house.rooms() if room.twin]
     a, b = (room for room in rooms if room.twin == rooms[0].twin)
-    assert [film.looks[k] for k in a.objects] == [film.looks[k] for k in b.objects]
+    assert [film.classes[k] for k in a.objects] == [film.classes[k] for k in b.objects]
     assert not set(a.objects) & set(b.objects)
     in_a, in_b = (np.flatnonzero([room.contains(x, y) for x, y in film.T_world_cam[:, :2, 3]]) for room in (a, b))
     assert len(in_a) > 100 and len(in_b) > 100

@@ -73,14 +73,14 @@ class Appearance:
         labels = {t.id: t.label for t in video.world.objects} | {m.id: m.label for m in video.movers}
         words = {label: k for k, label in enumerate(sorted(set(labels.values())))}
         self.top = max([int(video.ids.max(initial=0)), *labels])
-        self.looks = np.array([video.looks.get(k, 10_000 + k) for k in range(self.top + 1)])
+        self.classes = np.array([video.classes.get(k, 10_000 + k) for k in range(self.top + 1)])
         self.shared = np.zeros((self.top + 1, size))
         self.full = np.zeros((self.top + 1, size))
         rest = np.sqrt(1 - label_part**2)
         for k in range(1, self.top + 1):
             word = words.get(labels.get(k, ""), len(words))
             shared = label_part * _unit([video.seed, 31, word], size) + rest * _unit(
-                [video.seed, 32, self.looks[k]], size
+                [video.seed, 32, self.classes[k]], size
             )
             self.shared[k] = shared / np.linalg.norm(shared)
             self.full[k] = self.shared[k] + own_part * _unit([video.seed, 33, k], size)
@@ -90,8 +90,8 @@ class Appearance:
         """Return appearances (top + 1, D) as they are in a light: another than the first replaces a part of them."""
         if light == 0 or part == 0.0:
             return vectors
-        fresh = {int(v): _unit([self._seed, 38, light, v], self._size) for v in set(self.looks.tolist())}
-        change = np.stack([fresh[int(v)] for v in self.looks])
+        fresh = {int(v): _unit([self._seed, 38, light, v], self._size) for v in set(self.classes.tolist())}
+        change = np.stack([fresh[int(v)] for v in self.classes])
         return np.asarray(
             np.sqrt(1 - part**2) * vectors + part * change * (np.linalg.norm(vectors, axis=1) > 0)[:, None]
         )
@@ -99,7 +99,7 @@ class Appearance:
     def side(self, k: int, azimuth: Array) -> Array:
         """Return an object's appearance, the mean over directions (V,). Shape (D,)."""
         turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
-        return np.asarray(turns.mean(axis=0) @ _waves([self._seed, 39, int(self.looks[k])], self._size))
+        return np.asarray(turns.mean(axis=0) @ _waves([self._seed, 39, int(self.classes[k])], self._size))
 
 
 def track_feature(
@@ -127,20 +127,20 @@ def track_feature(
 def frame_descriptors(video: SimulatedVideo, settings: FrameDescriptorSettings, seed: int) -> Floats:
     """Unit-length descriptors of all frames of a video. Shape (F, D)."""
     count, size = len(video.ids), settings.size
-    looks = Appearance(video, size, 0.5, 0.0)
-    areas = _areas(video, looks.top)
-    structure = np.zeros(looks.top + 1, bool)
+    model = Appearance(video, size, 0.5, 0.0)
+    areas = _areas(video, model.top)
+    structure = np.zeros(model.top + 1, bool)
     structure[[t.id for t in video.world.objects if t.structure is not None]] = True
     amount = np.sqrt(areas) * np.where(structure, settings.structure_weight, 1.0)
     amount[..., 0] = 0.0
     content, arrangement = np.zeros((count, size)), np.zeros((count, size))
     lights = video.lights()
-    azimuth = azimuths(video, looks.top)
+    azimuth = azimuths(video, model.top)
     for light in sorted(set(lights.tolist())):
         rows = lights == light
-        shown = looks.lit(looks.shared, light, settings.light_part)
+        shown = model.lit(model.shared, light, settings.light_part)
         content[rows] = _normalised(np.sqrt((amount[rows] ** 2).sum(axis=1)) @ shown)
-        arrangement[rows] = _normalised(_arranged(video, amount[rows], azimuth[rows], looks, shown, settings))
+        arrangement[rows] = _normalised(_arranged(video, amount[rows], azimuth[rows], model, shown, settings))
     rng = np.random.default_rng([seed, video.seed, 34])
     lasting = rng.standard_normal((count, size))
     for run in runs_of(np.arange(count)):
@@ -156,15 +156,15 @@ def _arranged(
     video: SimulatedVideo,
     amount: Array,
     azimuth: Array,
-    looks: Appearance,
+    model: Appearance,
     shown: Array,
     settings: FrameDescriptorSettings,
 ) -> Array:
     """Sum over objects and parts of the picture of their appearance from the visible side, mixed by part. (F, D)."""
     size, part = settings.size, settings.side_part
-    seeds = sorted({int(v) for v in looks.looks})
+    seeds = sorted({int(v) for v in model.classes})
     waves = {v: _waves([video.seed, 36, v], size) for v in seeds}
-    table = np.stack([waves[int(v)] for v in looks.looks])
+    table = np.stack([waves[int(v)] for v in model.classes])
     turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
     side = np.einsum("ftk,tkd->ftd", turns, table)
     seen = np.sqrt(1 - part**2) * shown[None] + part * side

@@ -89,8 +89,7 @@ class _Reconstructed:
 
     reconstruction: Reconstruction
     shift: Floats | None
-    """Offsets to the points of depth and the one camera, chunk units: moving objects, and frames of another camera.
-    Shape (F, H, W, 3)."""
+    """Offsets to points by depth, chunk units: moving objects, and frames of another camera. Shape (F, H, W, 3)."""
 
 
 class FeedForwardModel:

@@ -16,7 +16,7 @@ from benchmarks.feedforward_sim.descriptors import (
     azimuths,
     track_feature,
 )
-from benchmarks.feedforward_sim.mask_errors import MaskErrorSettings, exchanged, parted, scraps
+from benchmarks.feedforward_sim.mask_errors import MaskErrorSettings, exchanged, fragments, parted
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.memory.masks import encode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
@@ -94,7 +94,7 @@ def unseen_home_errors() -> InstanceErrorSettings:
     """
     return InstanceErrorSettings(
         merge_share=0.2,
-        masks=MaskErrorSettings(missed=0.15, split=0.15, swapped=0.05, scraps=0.3),
+        masks=MaskErrorSettings(missed=0.15, split=0.15, swapped=0.05, fragments=0.3),
         embedding=EmbeddingSettings(noise=0.45, side_part=0.5, light_part=0.7),
     )
 
@@ -106,12 +106,12 @@ def simulate_library(
     rng = np.random.default_rng([*seed, 41])
     ids = video.ids[geometry.frames]
     tracks = _make_tracks(video, ids, geometry.points, settings, rng)
-    looks = Appearance(video, settings.embedding.size, settings.embedding.label_part, settings.embedding.own_part)
+    model = Appearance(video, settings.embedding.size, settings.embedding.label_part, settings.embedding.own_part)
     light = int(video.lights()[geometry.frames[0]]) if len(geometry.frames) else 0
-    colors = _in_light(_colors(video, looks.top), light)
-    azimuth = azimuths(video, looks.top)[geometry.frames] if settings.embedding.side_part else None
+    colors = _in_light(_colors(video, model.top), light)
+    azimuth = azimuths(video, model.top)[geometry.frames] if settings.embedding.side_part else None
     instances = tuple(
-        _instance(number, track, ids, geometry, _Appearance(looks, colors, azimuth, light), settings, rng)
+        _instance(number, track, ids, geometry, _Appearance(model, colors, azimuth, light), settings, rng)
         for number, track in enumerate(tracks)
     )
     return LocalLibrary(instances, _cannot_link(tracks, ids.shape), FEATURE_SPACE)
@@ -125,8 +125,7 @@ class _Appearance:
     colors: NDArray[np.uint8]
     """Of each object. Shape (T, 3)."""
     azimuth: NDArray[np.float64] | None
-    """Direction from each object to the camera of each frame, radians; None where appearance does not depend on it. (F,
-    T)."""
+    """Direction from each object to each camera, radians; None where appearance does not depend on it. (F, T)."""
     light: int
 
 
@@ -165,9 +164,9 @@ def _make_tracks(
                 leaks = _spill(masks, settings, rng)
                 kept = (positions[shown], masks[shown]) if loose else (positions, masks)
                 tracks.append(_Track(group, *kept, known, leaks))
-    if settings.masks.scraps:
-        count = round(settings.masks.scraps * sum(not t.structure for t in tracks))
-        for positions, masks in scraps(ids, points, structure, count, settings.masks, rng):
+    if settings.masks.fragments:
+        count = round(settings.masks.fragments * sum(not t.structure for t in tracks))
+        for positions, masks in fragments(ids, points, structure, count, settings.masks, rng):
             tracks.append(_Track((int(ids[positions][masks][0]),), positions, masks, False, 0.0))
     return tracks
 
@@ -198,8 +197,8 @@ def _groups(
 def _most_touched(ids: NDArray[np.int32], k: int, excluded: set[int]) -> int | None:
     a, b = ids[:, :, 1:], ids[:, :, :-1]
     c, d = ids[:, 1:], ids[:, :-1]
-    beside = np.concatenate([b[a == k], a[b == k], d[c == k], c[d == k]])
-    count = np.bincount(beside)
+    around = np.concatenate([b[a == k], a[b == k], d[c == k], c[d == k]])
+    count = np.bincount(around)
     count[0] = 0
     count[[n for n in excluded if n < len(count)]] = 0
     return int(count.argmax()) if len(count) and count.max() > 0 else None
@@ -239,20 +238,20 @@ def _instance(
     track: _Track,
     ids: NDArray[np.int32],
     geometry: ChunkGeometry,
-    looks: _Appearance,
+    model: _Appearance,
     settings: InstanceErrorSettings,
     rng: np.random.Generator,
 ) -> LocalInstance:
     held = ids[track.positions][track.masks]
-    count = np.bincount(held, minlength=looks.appearance.top + 1)
+    count = np.bincount(held, minlength=model.appearance.top + 1)
     count[0] = 0
     share = {int(k): float(count[k]) / max(int(count.sum()), 1) for k in np.flatnonzero(count)}
-    support, plane = _support(track, held, geometry, looks.colors, settings, rng)
-    seen_from = None if looks.azimuth is None else {k: looks.azimuth[track.positions, k] for k in share}
+    support, plane = _support(track, held, geometry, model.colors, settings, rng)
+    seen_from = None if model.azimuth is None else {k: model.azimuth[track.positions, k] for k in share}
     return LocalInstance(
         local_id=number,
         track=_mask_track(track, geometry),
-        feature=track_feature(looks.appearance, share, settings.embedding, rng, looks.light, seen_from),
+        feature=track_feature(model.appearance, share, settings.embedding, rng, model.light, seen_from),
         support=support,
         stability=float(np.clip(0.97 - 0.5 * track.leaking - 0.1 * rng.random(), 0, 1)),
         plane=plane if track.structure else None,

@@ -133,7 +133,7 @@ def placements(
         pivot = video.T_world_cam[here][:, :3, 3].mean(axis=0)
         found, best = None, settings.alike_least_score
         for before in range(number):
-            S, score = _lay_on_look_alikes(video, frames[side == before], here, settings)
+            S, score = _align_look_alikes(video, frames[side == before], here, settings)
             if score > best:
                 found, best = placed[before] @ S, score
         if found is None:
@@ -169,7 +169,7 @@ def _noise_about(pivot: Array, noise: tuple[float, float, float], rng: np.random
     return about @ Sim3.exp(x) @ about.inverse()
 
 
-def _lay_on_look_alikes(
+def _align_look_alikes(
     video: SimulatedVideo, frames_a: NDArray[np.int64], frames_b: NDArray[np.int64], settings: PoseErrorSettings
 ) -> tuple[Sim3, float]:
     """The upright motion that aligns most of side b's content with look-alikes of side a, and its amount."""
@@ -181,7 +181,7 @@ def _lay_on_look_alikes(
     if not one or not two:
         return found, best
     at_a, at_b = (np.array([objects[k].box().center for k in side]) for side in (one, two))
-    alike = np.array([[video.looks.get(i, -i) == video.looks.get(j, -j) for j in two] for i in one])
+    alike = np.array([[video.classes.get(i, -i) == video.classes.get(j, -j) for j in two] for i in one])
     weight = np.sqrt(np.minimum.outer([a[i] for i in one], [b[j] for j in two])) * alike
     for m, n in np.argwhere(alike):
         turn = rotation_exp(np.array([0.0, 0.0, objects[one[m]].yaw - objects[two[n]].yaw]))

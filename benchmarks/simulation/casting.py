@@ -22,9 +22,7 @@ _FIRST = 24
 class Caster:
     """Casts depth and ids for one camera; objects that move are put in their places through `scene`."""
 
-    def __init__(
-        self, fixed: Sequence[SimulatedObject], camera: Camera, moving: Sequence[SimulatedObject] = ()
-    ) -> None:
+    def __init__(self, fixed: Sequence[SimulatedObject], camera: Camera, moving: Sequence[SimulatedObject] = ()):
         self._camera = camera
         self.scene = SolidScene(fixed, moving)
         self._solids = self.scene.solids

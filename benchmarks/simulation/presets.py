@@ -264,8 +264,7 @@ class _Glimpse:
 
 
 def _near_view(take: Take, director: Director, poses: Array, frame: int) -> View | None:
-    """A view of the same target as from some frame on, from another place in that room; None in corridors and
-    doorways."""
+    """A view of a frame's target from another place in its room; None in corridors and doorways."""
     room = take.building.room_at(*poses[frame, :2, 3])
     if room is None or room.kind == "corridor":
         return None

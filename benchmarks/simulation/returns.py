@@ -221,10 +221,10 @@ def _cast(preset: str, seed: int, take: Take, later: SimulatedWorld | None, size
     for k, pose in enumerate(poses):
         depth[k], ids[k] = casters[int(k >= cut)].cast(pose)
     light = (np.arange(len(poses)) >= cut).astype(np.int64) if preset in _LIT else None
-    looks = appearance_classes(world.objects)
+    classes = appearance_classes(world.objects)
     time_s = np.arange(len(poses)) / take.path.fps
     return SimulatedVideo(
-        preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), looks, light, later, other
+        preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), classes, light, later, other
     )
 
 

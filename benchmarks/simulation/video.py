@@ -41,7 +41,7 @@ class SimulatedVideo:
     cuts: tuple[int, ...]
     """Frames before which the camera jumps."""
     movers: tuple[MoverTruth, ...]
-    looks: dict[int, int]
+    classes: dict[int, int]
     """Class of appearance of each object: two objects of one class are twins."""
     light: NDArray[np.int64] | None = None
     """Which light each frame was filmed in; None where it is all the same. Shape (F,)."""

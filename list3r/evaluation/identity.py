@@ -41,20 +41,20 @@ def evaluate_identities(
     object has an id when that mask's IoU with its pixels is `least_iou` or more; its last id has priority. `wanted` are
     the counted true ids, None for all. Raises `OptionError` for masks of another size.
     """
-    carried: dict[int, list[int]] = {}
+    ids_of: dict[int, list[int]] = {}
     count = switches = 0
     for labels, masks in frames:
         count += 1
         for true_id, ids in _covered(labels, masks, least_iou).items():
             if wanted is not None and true_id not in wanted:
                 continue
-            history = carried.setdefault(true_id, [])
+            history = ids_of.setdefault(true_id, [])
             if history and history[-1] in ids:
                 continue
             switches += bool(history)
             history.append(ids[0])
-    several = {k: tuple(dict.fromkeys(h)) for k, h in sorted(carried.items()) if len(set(h)) > 1}
-    return IdentityErrors(count, len(carried), switches, several)
+    several = {k: tuple(dict.fromkeys(h)) for k, h in sorted(ids_of.items()) if len(set(h)) > 1}
+    return IdentityErrors(count, len(ids_of), switches, several)
 
 
 def _covered(labels: Labels, masks: Sequence[tuple[int, Mask]], least_iou: float) -> dict[int, list[int]]:

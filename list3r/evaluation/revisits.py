@@ -171,8 +171,7 @@ def judge(
 def frame_labels(
     share: ArrayLike, settings: RevisitTruthSettings | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which frame pairs are revisits and which see different places, by directed shares (F, F); NaN is
-    neither."""
+    """Return which frame pairs are revisits and which different places, by directed shares (F, F); NaN is neither."""
     chosen = settings or RevisitTruthSettings()
     s = np.asarray(share)
     return np.minimum(s, s.T) >= chosen.least, np.maximum(s, s.T) < chosen.different

@@ -16,7 +16,7 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class Component:
-    """Chunks and instances in one coordinate frame. Two components were never placed against each other: do not overlay
+    """Chunks and instances in one coordinate frame. Components are not placed against each other: do not overlay
     them."""
 
     id: int

@@ -143,8 +143,7 @@ def is_database(path: Path) -> bool:
 
 
 def part_path(path: Path, name: str) -> Path:
-    """Return the path of one more file of an export: `scene.component_7.ply` next to `scene.ply`; `path` for no
-    name."""
+    """Return the path of a further file: `scene.component_7.ply` next to `scene.ply`; `path` for no name."""
     return path.with_name(f"{path.stem}.{name}{path.suffix}") if name else path
 
 

@@ -23,17 +23,17 @@ def up_axis_notes(objects: Sequence[NDArray[np.float32]], up: str) -> tuple[str,
         return ()
     finite = [points[np.isfinite(points).all(axis=1)] for points in objects]
     boxes = np.array([[p.min(axis=0), p.max(axis=0)] for p in finite if len(p)]).reshape(-1, 2, 3)
-    standing = {axis: _standing(boxes, axis) for axis in _AXES}
-    best = max(standing, key=lambda axis: standing[axis])
-    if standing[best] < max(_LEAST, _TIMES * standing[up]) or best == up:
+    resting = {axis: _count_resting(boxes, axis) for axis in _AXES}
+    best = max(resting, key=lambda axis: resting[axis])
+    if resting[best] < max(_LEAST, _TIMES * resting[up]) or best == up:
         return ()
     return (
-        f"{standing[best]} objects rest on others along {best} and {standing[up]} along {up}: if {best} points up, "
+        f"{resting[best]} objects rest on others along {best} and {resting[up]} along {up}: if {best} points up, "
         f"import the map again with --up {best}",
     )
 
 
-def _standing(boxes: NDArray[np.float64], axis: str) -> int:
+def _count_resting(boxes: NDArray[np.float64], axis: str) -> int:
     """Return how many boxes (N, 2, 3) are on a larger one along an axis."""
     k, sign = "xyz".index(axis[-1]), -1.0 if axis.startswith("-") else 1.0
     low, high = np.sort(sign * boxes[:, :, k], axis=1).T

@@ -36,8 +36,7 @@ class Proposals:
     names: tuple[str, ...] | None = None
     """Class name of each candidate, where the discoverer has names. N of them."""
     whole: NDArray[np.float32] | None = None
-    """Calibrated probability that each candidate is one object and all of it, where the discoverer knows. Shape
-    (N,)."""
+    """Calibrated probability that each candidate is one whole object, where the discoverer knows. Shape (N,)."""
     named: tuple[tuple[tuple[str, float], ...], ...] | None = None
     """Names that each candidate may have, with their probabilities over all anchors, where it knows. N of them."""
     low_confidence: Proposals | None = None

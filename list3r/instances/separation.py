@@ -78,7 +78,7 @@ def _two_objects(one: _Part, two: _Part, unit: float) -> bool:
         return _color_difference(a, b) > COLOR_DIFFERENCE
     gap = _gap(one, two, 1.1 * ROOM_M * unit) / unit
     if gap < TOUCHING_M:
-        return _stands_on(a, b, unit) or _stands_on(b, a, unit)
+        return _rests_on(a, b, unit) or _rests_on(b, a, unit)
     return (one.small(unit) and two.small(unit)) or gap > ROOM_M or a.structure or b.structure
 
 
@@ -102,7 +102,7 @@ def _on_plane(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
     return bool(np.median(np.abs(a.support.points @ b.plane[:3] + b.plane[3])) < 0.05 * unit)
 
 
-def _stands_on(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
+def _rests_on(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
     """True where a is all on the open side of the flat b and rises well from it."""
     if b.plane is None:
         return False

@@ -134,7 +134,7 @@ class MoverInstanceSettings:
 
     whole: float = 0.5
     """Share of its largest mask that a view must have to show where it was last."""
-    beside: int = 2
+    neighbours: int = 2
     """Frames on either side of that view whose points are added, moved to where it was then."""
     rest_m: float = 0.05
     """Places this near to the last one are one place of rest."""

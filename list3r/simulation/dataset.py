@@ -84,8 +84,7 @@ class WalkSettings:
         return ()
 
     def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
-        """Return the content of `truth.json`; `seen` has the counts of each object's id, as `world_truth` takes
-        them."""
+        """Return the content of `truth.json`; `seen` has the counts of each object id, see `world_truth`."""
         return world_truth(self.world(), seen)
 
 

@@ -121,9 +121,9 @@ class Viewer:
             self._layers.changes(world, visible=s.colors == "changes")
             self._layers.clear("relations")
             if s.selected is not None:
-                self._tell(s.selected)
+                self._describe(s.selected)
             else:
-                self.panel.tell("Click an instance, or search for one.", None)
+                self.panel.describe("Click an instance, or search for one.", None)
         self._draw_points()
         for page in self._open_pages():
             page.names.draw(self.world, self.state.selected, visible=self.state.labels)
@@ -144,20 +144,19 @@ class Viewer:
         self._pages = {n: page for n, page in self._pages.items() if n in there}
         return list(self._pages.values())
 
-    def _tell(self, instance_id: int) -> None:
+    def _describe(self, instance_id: int) -> None:
         relations = list(self.memory.relations(subject=instance_id))
         self._layers.relations(self.world, instance_id, relations)
         try:
             picture = _enlarged(self.memory.picture(instance_id).crop())
         except List3rError:
             picture = None
-        self.panel.tell(described(self.memory, self.world, instance_id, relations), picture)
+        self.panel.describe(described(self.memory, self.world, instance_id, relations), picture)
 
     # ------------------------------------------------------------------ what a user does
 
     def find(self, text: str) -> list[int]:
-        """Search, select the best answer and look at it; the ids that answer. The panel names words that were not
-        found."""
+        """Search, select the best answer and look at it; returns the ids. The panel names words that were not found."""
         found = self.memory.find(text, 10)
         ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
         self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join(found.notes))

@@ -82,7 +82,7 @@ class PageClouds:
         """As measured on the page; None where it was not, and then all is drawn."""
 
     @property
-    def settled(self) -> bool:
+    def at_rest(self) -> bool:
         """Whether the page shows its picture at rest."""
         with self._lock:
             return FINE in self._nodes and not self._moving

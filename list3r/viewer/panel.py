@@ -46,7 +46,7 @@ class Panel:
 
     # ------------------------------------------------------------------ messages
 
-    def tell(self, text: str, picture: NDArray[np.uint8] | None) -> None:
+    def describe(self, text: str, picture: NDArray[np.uint8] | None) -> None:
         """Describe the selection."""
         self._text.content = text
         self._picture.visible = picture is not None

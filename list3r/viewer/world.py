@@ -83,7 +83,7 @@ class ShownWorld:
     def name(self, instance_id: int) -> str:
         """Return the name of an instance."""
         i = self.instances[instance_id]
-        return i.label or i.structure or i.description.split(",")[0] or "thing"
+        return i.label or i.structure or i.description.split(",")[0] or "object"
 
 
 def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:

@@ -84,7 +84,7 @@ def list_instances(
             found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.units
     kept = [i for i in found if i.confidence >= least]
-    kinds, starts = ("", "scrap", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
+    kinds, starts = ("", "low-confidence", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
     if json:
         print_answer(map(instance_dict, kept), units, total=len(found))
         return

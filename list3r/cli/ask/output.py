@@ -36,12 +36,8 @@ Label = Annotated[
     typer.Option("--label", metavar="WORDS", help="Only instances with one of these words in label or description."),
 ]
 Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only instances of this colour.")]
-MinSize = Annotated[
-    float | None, typer.Option("--min-size", help="Only instances with a longest edge of at least this.")
-]
-MaxSize = Annotated[
-    float | None, typer.Option("--max-size", help="Only instances with a longest edge of at most this.")
-]
+MinSize = Annotated[float | None, typer.Option("--min-size", help="Only instances with at least this longest edge.")]
+MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only instances with at most this longest edge.")]
 State = Annotated[
     str | None,
     typer.Option(

@@ -19,10 +19,10 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
     """
     from list3r.memory.errors import MemoryFileError
 
-    found, state, chunks, beside = [], [], None, None
+    found, state, chunks, leftovers = [], [], None, None
     try:
         with open_memory(memory) as scene:
-            beside = scene.store.beside()
+            leftovers = scene.store.beside()
             found = scene.store.verify()
             if not found:
                 chunks = len(scene.store.chunks.all())
@@ -32,7 +32,7 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
             raise
         found = [f"it cannot be opened: {error.__cause__}"]
     if json:
-        facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": beside}
+        facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": leftovers}
         print_answer([{**facts, "sessions": state, "chunks": chunks}])
     elif found:
         say(*found)
@@ -42,8 +42,8 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
             "; the build is unfinished, continue with --resume" if any(s["state"] == "building" for s in state) else ""
         )
         say(f"{memory} is sound: {chunks} chunks{unfinished}")
-    if beside and not json:
-        say(beside)
+    if leftovers and not json:
+        say(leftovers)
     if found:
         raise typer.Exit(1)
 

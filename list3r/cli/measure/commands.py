@@ -152,9 +152,9 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: 
     check_plot(asked.plot)
     check_every(asked.every)
     true, found = read_scene(truth), read_scene_of(estimate)
-    beside = truth.parent / "groundtruth.txt"
-    if align is None and is_database(estimate) and beside.is_file():
-        align = str(beside)
+    groundtruth = truth.parent / "groundtruth.txt"
+    if align is None and is_database(estimate) and groundtruth.is_file():
+        align = str(groundtruth)
     free = free_scale(asked.scale, estimate)
     S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, free=free)
     scores = evaluate_scene(found, true, S_truth_scene)

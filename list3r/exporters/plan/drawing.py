@@ -228,8 +228,7 @@ def _draw_loops(ax: Axes, view: PlanView, ends: NDArray[np.float64]) -> None:
 
 
 def _draw_camera_path(ax: Axes, view: PlanView, component: Component) -> None:
-    """Draw where the camera went, from green to red, with short strokes in its viewing direction; gaps where it was
-    lost."""
+    """Draw the camera's path from green to red, with short strokes in its viewing direction; gaps where it was lost."""
     fade = mpl.colors.LinearSegmentedColormap.from_list("path", [_START, _END])
     reach = 0.012 * float((view.high - view.low).max())
     for session in sorted({frame.session_id for frame, _ in component.poses}):

@@ -180,7 +180,7 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
     xform = UsdGeom.Xform.Define(stage, path)
     prim = xform.GetPrim()
     Usd.ModelAPI(prim).SetKind("component")
-    prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'instance'} #{instance.id}")
+    prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'object'} #{instance.id}")
     set_labels(prim, instance)
     prim.SetDocumentation(instance.description or class_token(instance))
     _set_facts(prim, instance)

@@ -69,8 +69,8 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         came = [left[c.chunk_id] for c in here if _is(c, session_id) != _is(chunk, session_id)]
         nodes = store.local_instances.nodes([chunk.chunk_id])
         place = _Change(left[chunk.chunk_id], came, compared(seen, s), unit, s)
-        standing = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
-        clusters = _unexplained(place, nodes, standing, chunk)
+        explain = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
+        clusters = _unexplained(place, nodes, explain, chunk)
         if not clusters:
             continue
         frames = [f for f in store.frames.all(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
@@ -82,7 +82,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
             obj = maker.make(following, cluster)
             if obj is not None:
                 store.local_instances.add(chunk.chunk_id, obj)
-                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(obj, nodes, standing, in_chunk, s))
+                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(obj, nodes, explain, in_chunk, s))
                 following += 1
                 added += 1
     return added
@@ -92,7 +92,7 @@ def _is(chunk: ChunkRow, session_id: int) -> bool:
     return chunk.session_id == session_id
 
 
-# ---------------------------------------------------------------------------------------------- what stands for it
+# ------------------------------------------------------------------------------------------------- explained by
 
 
 def _clusters(points: Array, unit: float, s: ChangedPlaceSettings) -> list[Ints]:
@@ -143,22 +143,22 @@ class _Change:
         return bool(known.any() and float(np.mean(near[known])) >= self.settings.explained)
 
 
-def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[bool], chunk: ChunkRow) -> list[Array]:
+def _unexplained(place: _Change, nodes: Sequence[LocalNode], explain: Sequence[bool], chunk: ChunkRow) -> list[Array]:
     """Clusters of surfaces that are gone and that no instance of the chunk represents. Shapes (N, 3)."""
     s, unit, points = place.settings, place.unit, place.gone
     clusters = _clusters(points, unit, s)
     if not clusters:
         return []
     reach = 1.5 * s.voxel_m * unit
-    stood_for = np.zeros(len(points), bool)
-    for node, stands in zip(nodes, standing, strict=True):
-        if stands:
+    taken = np.zeros(len(points), bool)
+    for node, does in zip(nodes, explain, strict=True):
+        if does:
             support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
-            stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
+            taken |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
     out = []
     for rows in clusters:
-        left = rows[~stood_for[rows]]
-        if len(left) >= (1.0 - s.scrap) * len(rows):
+        left = rows[~taken[rows]]
+        if len(left) >= (1.0 - s.explained_share) * len(rows):
             out.append(points[rows])
         else:
             out += [points[left[r]] for r in _clusters(points[left], unit, s) if len(r) >= s.part * len(rows)]
@@ -166,13 +166,13 @@ def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[
 
 
 def _mixed_with(
-    obj: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
+    obj: LocalInstance, nodes: Sequence[LocalNode], explain: Sequence[bool], unit: float, s: ChangedPlaceSettings
 ) -> list[tuple[int, int]]:
     """Cannot-link pairs of an object with the chunk's instances that mix part of it with unchanged surfaces."""
     reach = 1.5 * s.voxel_m * unit
     out = []
-    for node, stands in zip(nodes, standing, strict=True):
-        if stands or len(node.support.points) == 0:
+    for node, does in zip(nodes, explain, strict=True):
+        if does or len(node.support.points) == 0:
             continue
         covered = cKDTree(node.support.points).query(obj.support.points, distance_upper_bound=reach)[0] < np.inf
         if float(np.mean(covered)) >= s.mixed:
@@ -180,7 +180,7 @@ def _mixed_with(
     return out
 
 
-# ---------------------------------------------------------------------------------------------- what becomes of it
+# ------------------------------------------------------------------------------------------------------- result
 
 
 class _Maker:

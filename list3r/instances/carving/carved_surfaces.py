@@ -39,12 +39,10 @@ class ChangedPlaceSettings:
     largest_m: float = 1.2
     """Diagonal of the largest; larger ones are doors, curtains or registration errors."""
     explained: float = 0.7
-    """Share of an instance's observed points that must be at removed or replaced surfaces for it to explain the
-    change."""
+    """Share of an instance's observed points at removed or replaced surfaces, for it to explain the change."""
     mixed: float = 0.2
-    """Share of a found object that is on another instance of the chunk, which does not represent it, for the two to be
-    kept apart."""
-    scrap: float = 0.35
+    """Share of a found object on another instance of the chunk that does not explain it, for a cannot-link."""
+    explained_share: float = 0.35
     """A cluster of which instances explain at most this share is segmented again as a whole object."""
     part: float = 0.3
     """Share of a cluster that its unexplained rest must have, to be an object of its own."""

@@ -105,8 +105,8 @@ def without_lone(labels: Labels) -> tuple[Labels, Labels]:
             alike = np.int32(over[k] == here) + np.int32(over[k + 1] == here) + np.int32(over[k + 2] == here)
             alike += np.int32(on[k] == here) + np.int32(on[k + 2] == here)
             alike += np.int32(under[k] == here) + np.int32(under[k + 1] == here) + np.int32(under[k + 2] == here)
-            beside = max(np.int32(0), over[k], over[k + 1], over[k + 2], on[k], on[k + 2])
-            most[row, k] = max(beside, under[k], under[k + 1], under[k + 2])
+            around = max(np.int32(0), over[k], over[k + 1], over[k + 2], on[k], on[k + 2])
+            most[row, k] = max(around, under[k], under[k + 1], under[k + 2])
             kept[row, k] = here if alike >= 3 else 0
     return kept, most
 
@@ -143,8 +143,7 @@ def label_runs(
 
 @compiled
 def meeting(keys: NDArray[np.int64], shift: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Positions of ascending keys k for which k + `shift` is a key, and the positions of k + `shift`. Shape (H,)
-    each."""
+    """Positions of ascending keys k with k + `shift` among the keys, and of k + `shift`. Shape (H,) each."""
     here, there = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
     count, at = 0, 0
     for k in range(len(keys)):

@@ -124,11 +124,10 @@ def group(
 
 
 FAR = 3
-"""Doublings of the voxel's size at which parts are neighbours: a view from above hides up to 16 cm between a leg and
-its table top."""
+"""Doublings of the voxel's size at which parts are neighbours: up to 16 cm between a leg and its table top are
+hidden."""
 EXTRA_NODES = 2
-"""Columns that `group` adds to the features of pieces besides the first network's hidden state: structure and number of
-pieces."""
+"""Columns that `group` adds to the features of pieces and the hidden state: structure and number of pieces."""
 EXTRA_EDGES = 4
 
 

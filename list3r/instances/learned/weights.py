@@ -11,8 +11,7 @@ from list3r.weights import Float, WeightsFormat
 FORMAT = WeightsFormat("discovery", version=3)
 SHIPPED = Path(__file__).with_name("weights.npz")
 COMPUTED = Path(__file__).with_name("weights-computed.npz")
-"""Shipped for depth that was computed: weights that also learned from few colours are worse there (research/discovery
-0179)."""
+"""Shipped for computed depth: weights that also learned from few colours are worse there (research/discovery 0179)."""
 
 
 @lru_cache(maxsize=4)

@@ -111,9 +111,9 @@ def _support(
         good = size >= s.whole * size.max()
     last = int(np.flatnonzero(good)[-1])
     resting = np.flatnonzero(np.linalg.norm(places - places[-1], axis=1) < s.rest_m)
-    chosen = [n for n in range(last - s.beside, last + s.beside + 1) if 0 <= n < len(blobs)]
-    if len(resting) > 2 * s.beside and good[resting].any():
-        chosen = resting[good[resting]][:: max(1, len(resting) // (2 * s.beside + 1))].tolist()
+    chosen = [n for n in range(last - s.neighbours, last + s.neighbours + 1) if 0 <= n < len(blobs)]
+    if len(resting) > 2 * s.neighbours and good[resting].any():
+        chosen = resting[good[resting]][:: max(1, len(resting) // (2 * s.neighbours + 1))].tolist()
         last = chosen[-1]
     stride = max(1, round(reconstruction.camera.width / 320))
     points, rgb, confidence = [], [], []

@@ -100,8 +100,8 @@ class ContactShadows:
     def _bake(self, corners: NDArray[np.float64], height: float, shape: tuple[int, ...]) -> Floats:
         dark = np.zeros(shape, np.float32)
         bottom, top = corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)
-        standing = np.flatnonzero((bottom > height - 0.05) & (top > height + 0.015) & (bottom < height + 1.0))
-        for n in standing[np.argsort(-bottom[standing], kind="stable")]:
+        casting = np.flatnonzero((bottom > height - 0.05) & (top > height + 0.015) & (bottom < height + 1.0))
+        for n in casting[np.argsort(-bottom[casting], kind="stable")]:
             ground = (corners[n, ::2, :2] - self._origin) / _CELL_M
             hull = cv2.convexHull(ground.astype(np.float32)).astype(np.int32)
             strength = float(np.exp(-max(bottom[n] - height, 0.0) / 0.5))

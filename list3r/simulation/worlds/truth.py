@@ -83,11 +83,11 @@ def _close(a: SimulatedObject, b: SimulatedObject) -> list[str]:
         return []
     one, two = a.box(), b.box()
     half = 0.25 * float(one.size.max() + two.size.max())
-    near, beside = float(np.clip(half, *NEAR_M)), float(np.clip(half, *NEXT_TO_M))
+    near, next_to = float(np.clip(half, *NEAR_M)), float(np.clip(half, *NEXT_TO_M))
     if footprint_gap(one, two) > near or (gap := surface_gap(a, b)) > near:
         return []
     rug = "rug" in (a.label, b.label)
-    return ["near", "next_to"] if gap <= beside and not rug and _share_heights(one, two) else ["near"]
+    return ["near", "next_to"] if gap <= next_to and not rug and _share_heights(one, two) else ["near"]
 
 
 def _share_heights(one: OrientedBox, two: OrientedBox) -> bool:
