@@ -62,9 +62,8 @@ def test_segmenter_proposes_disjoint_named_masks(model: str, checkpoints: dict[s
 @pytest.mark.parametrize("model", ["sam2", "sam3"])
 def test_point_grid_finds_masks(model: str, checkpoints: dict[str, Path], chunk) -> None:
     frames, _ = chunk
-    masks = SamMasks(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(sam=SAM_ALL)).look(
-        frames[3].color
-    )
+    discoverer = SamMasks(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(sam=SAM_ALL))
+    masks = discoverer.segment(frames[3].color)
     assert masks.probability.shape[1:] == frames[3].color.shape[:2]
     assert len(masks.score) == len(masks.features) == len(masks.probability)
     assert (np.diff(masks.score) <= 0).all()
@@ -99,7 +98,9 @@ def test_every_network_runs_in_half_precision(
         made = list(Appearance(model, checkpoints[name], "cpu").tokens(color))
     elif part == "discovery":
         maker = SamMasks if model.startswith("sam") else QuerySegmenter
-        found = maker(model, checkpoints[name], "cpu", InstanceSettings(candidates=EVERYTHING, sam=SAM_ALL)).look(color)
+        found = maker(model, checkpoints[name], "cpu", InstanceSettings(candidates=EVERYTHING, sam=SAM_ALL)).segment(
+            color
+        )
         assert len(found.score) > 0
         made = [found.probability, found.score, found.features]
     else:

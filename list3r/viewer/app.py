@@ -161,13 +161,13 @@ class Viewer:
         ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
         self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join(found.notes))
         if ids:
-            self.select(ids[0], look=True)
+            self.select(ids[0], turn=True)
         return ids
 
-    def select(self, instance_id: int | None, *, look: bool = False) -> None:
-        """Select an instance, and turn all cameras to it where `look`."""
+    def select(self, instance_id: int | None, *, turn: bool = False) -> None:
+        """Select an instance, and turn all cameras to it where `turn`."""
         self.show(selected=instance_id)
-        if look and instance_id in self.world.instances and instance_id is not None:
+        if turn and instance_id in self.world.instances and instance_id is not None:
             i = self.world.instances[instance_id]
             reach = max(float(np.linalg.norm(i.box.size)), 0.1)
             for client in self.server.get_clients().values():

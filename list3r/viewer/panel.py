@@ -93,7 +93,7 @@ class Panel:
         def choose(_: object) -> None:
             chosen = self._answers.get(self._choice.value)
             if chosen is not None and chosen != self._viewer.state.selected:
-                self._viewer.select(chosen, look=True)
+                self._viewer.select(chosen, turn=True)
 
         self._choice.on_update(choose)
 

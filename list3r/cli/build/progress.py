@@ -48,7 +48,7 @@ def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
     """Return the callback of a progress bar while a video is scanned before its chunks; then it restarts as `then`."""
     now = then
 
-    def look(what: str, done: int, total: int) -> None:
+    def scan(what: str, done: int, total: int) -> None:
         nonlocal now
         if now != what:
             bar.stage(f"looking for {what}")
@@ -58,7 +58,7 @@ def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
             bar.stage(then, "frames")
             now = then
 
-    return look
+    return scan
 
 
 def say_result(

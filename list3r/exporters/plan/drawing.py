@@ -240,8 +240,8 @@ def _draw_camera_path(ax: Axes, view: PlanView, component: Component) -> None:
         lines = [xy[k : k + 2] for k in joined]
         ax.add_collection(LineCollection(lines, colors=fade(joined / len(xy)), linewidths=1.6, zorder=5))
         shown_at = np.arange(0, len(xy), max(1, len(xy) // 30))
-        looks = view.on_page(np.stack([poses[k][1].rotation[:, 2] for k in shown_at])) * reach
-        strokes = [(xy[k], xy[k] + look) for k, look in zip(shown_at, looks, strict=True)]
+        ahead = view.on_page(np.stack([poses[k][1].rotation[:, 2] for k in shown_at])) * reach
+        strokes = [(xy[k], xy[k] + step) for k, step in zip(shown_at, ahead, strict=True)]
         ax.add_collection(LineCollection(strokes, colors=fade(shown_at / len(xy)), linewidths=1.1, zorder=5))
         close = bool(np.linalg.norm(xy[-1] - xy[0]) < 4 * reach)
         for at, word, color, mark, side in (

@@ -99,11 +99,11 @@ def ranked_instances(memory: SceneMemory, objects: Sequence[Instance], question:
     named |= {i.id: 2.0 for i in objects if i.id in written}
     if not named:
         return usual
-    anchors = np.array([i.center for i in objects if i.id in named])
+    middles = np.array([i.center for i in objects if i.id in named])
     order = {i.id: n for n, i in enumerate(usual)}
 
     def rank(i: Instance) -> tuple[float, float, int]:
-        away = float(np.linalg.norm(anchors - i.center, axis=1).min())
+        away = float(np.linalg.norm(middles - i.center, axis=1).min())
         return -named.get(i.id, 0.0), away, order[i.id]
 
     return sorted(objects, key=rank)

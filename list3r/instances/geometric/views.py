@@ -20,7 +20,7 @@ from list3r.instances.geometric.fusion import (
     small_color,
 )
 from list3r.instances.geometric.kernels import read_across
-from list3r.instances.geometric.registration import align_views, moved_view
+from list3r.instances.geometric.view_alignment import align_views, moved_view
 from list3r.instances.settings import AnchorViewSettings, InstanceSettings
 from list3r.reconstruction.base import Reconstruction, backproject
 

@@ -60,9 +60,9 @@ class QuerySegmenter:
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Candidates on the frame at `position`."""
         views = chunk_views(frames, reconstruction, self._settings)
-        return choose_candidates(self.look(frames[position].color), views, position, self._settings.candidates)
+        return choose_candidates(self.segment(frames[position].color), views, position, self._settings.candidates)
 
-    def look(self, color: NDArray[np.uint8]) -> SoftMasks:
+    def segment(self, color: NDArray[np.uint8]) -> SoftMasks:
         """Return the network's masks of one picture (H, W, 3), without empty queries."""
         import torch
 
