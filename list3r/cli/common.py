@@ -9,7 +9,6 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextvars import ContextVar
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
@@ -23,6 +22,9 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory
 
 MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memory file.", show_default=False)]
+AtOption = Annotated[
+    int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -39,45 +41,15 @@ def parse_point(text: str, option: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-_AT: ContextVar[int | None] = ContextVar("at", default=None)
-"""The session after which the world is asked about, for the command that runs."""
-
-
-def asked_at() -> int | None:
-    """Return the session of `--at` of the command that runs."""
-    return _AT.get()
-
-
 @contextlib.contextmanager
-def open_memory(path: Path, min_confidence: float | None = None) -> Iterator[SceneMemory]:
-    """The memory of a path, for reading: now, after the session of `--at`, or with all segments of a least confidence.
+def open_memory(path: Path, min_confidence: float | None = None, at: int | None = None) -> Iterator[SceneMemory]:
+    """The memory of a path, for reading: now, after the session `at`, or with all segments of a least confidence.
     All reads see one state, also while a build or an update commits.
     """
     from list3r.api import open as open_scene
 
-    with open_scene(path, at=_AT.get(), min_confidence=min_confidence) as scene, scene.store.snapshot():
+    with open_scene(path, at=at, min_confidence=min_confidence) as scene, scene.store.snapshot():
         yield scene
-
-
-def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The same command with `--at SESSION`, which `open_memory` obeys while it runs."""
-    signature = inspect.signature(command, eval_str=True)
-    option = Annotated[
-        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
-    ]
-    added = inspect.Parameter("at", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
-
-    @functools.wraps(command)
-    def asked(*args: Any, at: int | None = None, **values: Any) -> Any:
-        before = _AT.set(at)
-        try:
-            return command(*args, **values)
-        finally:
-            _AT.reset(before)
-
-    asked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
-    asked.__annotations__ = {**get_type_hints(command, include_extras=True), "at": option}
-    return asked
 
 
 def only(*names: str) -> tuple[str, ...]:

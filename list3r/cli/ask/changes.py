@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, in_column, open_memory, print_table
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, open_memory, print_table
 from list3r.cli.terminal import note
 
 
@@ -21,6 +21,7 @@ def changes(
         float, typer.Option("--min-confidence", help="Only changes with at least this confidence.")
     ] = 0.0,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The instances that were moved, removed or added between sessions, with frames that show it.
 
@@ -29,7 +30,7 @@ def changes(
     from list3r.queries.changes import KINDS
     from list3r.queries.changes import changes as find
 
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         found = find(scene.store, since, KINDS if seen_again else KINDS[:3], min_confidence)
         alone = not found and len(scene.sessions()) < 2
         notes = ["the memory holds one session; `list3r update` adds a later one to compare with"] if alone else []

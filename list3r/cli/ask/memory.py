@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, in_column, open_memory, print_table
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, open_memory, print_table
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
@@ -62,9 +62,7 @@ def list_instances(
             help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
         ),
     ] = None,
-    at: Annotated[
-        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
-    ] = None,
+    at: AtOption = None,
     json: JsonOption = False,
 ) -> None:
     """List the instances with their place and size.

@@ -20,19 +20,25 @@ from list3r.cli.ask.arguments import (
 from list3r.cli.ask.changes import changes
 from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
 from list3r.cli.catalog.questions import with_catalog
-from list3r.cli.common import JsonOption, MemoryArgument, only, open_memory, print_table, spread, with_at
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, only, open_memory, print_table, spread
 from list3r.cli.terminal import note, say
 
 
 def nearest(
-    memory: MemoryArgument, near: NearArguments, *, k: Count = 5, filters: FilterArguments, json: JsonOption = False
+    memory: MemoryArgument,
+    near: NearArguments,
+    *,
+    k: Count = 5,
+    filters: FilterArguments,
+    json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The instances nearest to a point or an instance, with distances of surfaces and of centres.
 
     Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
     """
     origin = near.origin()
-    with open_memory(memory, filters.min_confidence) as scene:
+    with open_memory(memory, filters.min_confidence, at) as scene:
         from list3r.queries.nearest import nearest as ask
 
         matches = ask(
@@ -56,13 +62,14 @@ def within(
     occlusion: Annotated[bool, typer.Option(help="Leave out instances that others hide from the camera.")] = True,
     filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The instances inside a box or a sphere, or those that a camera sees.
 
     Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
     """
     lengths: dict[str, Any] = region.lengths(camera)
-    with open_memory(memory, filters.min_confidence) as scene:
+    with open_memory(memory, filters.min_confidence, at) as scene:
         seen_by = camera_from(scene, camera)
         found = scene.within(
             **lengths, camera=seen_by, max_depth=camera.max_depth, occlusion=occlusion, **filters.options()
@@ -70,12 +77,12 @@ def within(
         print_matches(found, scene.units, json, total=len(found))
 
 
-def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False) -> None:
+def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False, at: AtOption = None) -> None:
     """The relations between instances, by subject, predicate and object.
 
     Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
     """
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         print_relations(scene, scene.relations(**asdict(asked)), json)
 
 
@@ -86,6 +93,7 @@ def similar(
     k: Count = 5,
     filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The instances most similar in appearance to one instance or to a picture.
 
@@ -93,7 +101,7 @@ def similar(
     """
     from list3r.memory.errors import OptionError
 
-    with open_memory(memory, filters.min_confidence) as scene:
+    with open_memory(memory, filters.min_confidence, at) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
             raise OptionError("give a query: --id ID, or --image FILE, with --box for a part of it")
         if like.image is not None:
@@ -118,12 +126,13 @@ def find(
         typer.Option("--from", metavar="ID|camera|X,Y,Z", help="Viewpoint of left, right, in front of and behind."),
     ] = None,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The instances that a text describes by attributes, a noun and relations; an id can replace words.
 
     Example: list3r query find house.l3r "white mug on table"
     """
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         found, units = scene.find(text, k, viewpoint=viewpoint), scene.units
     print_matches(found, units, json, ambiguous=found.ambiguous, unknown_words=found.unknown_words)
 
@@ -134,6 +143,7 @@ def seen(
     instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
     structure: Structure = False,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """When an instance was seen, or what was visible at a time, in a frame, or from a pose.
 
@@ -141,7 +151,7 @@ def seen(
     """
     from list3r.memory.errors import OptionError
 
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         camera = camera_from(scene, options)
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
@@ -188,12 +198,13 @@ def path(
     end: Annotated[int, typer.Argument(metavar="ID", help="Second instance.", show_default=False)],
     structure: Annotated[bool, typer.Option(help="Allow paths over floor and walls.")] = True,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The shortest chain of relations from one instance to another.
 
     Example: list3r query path house.l3r 12 4
     """
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         found = scene.path_between(start, end, structure=structure)
         print_relations(scene, found, json)
 
@@ -204,6 +215,6 @@ questions = typer.Typer(
     rich_markup_mode=None,
 )
 for command in (nearest, within, relations, similar, find):
-    questions.command(command.__name__)(with_at(with_catalog(spread(command))))
+    questions.command(command.__name__)(with_catalog(spread(command)))
 for other in (seen, path, changes):
-    questions.command(other.__name__)(with_at(spread(other)))
+    questions.command(other.__name__)(spread(other))

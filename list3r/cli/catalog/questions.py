@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import asked_at, in_column, parse_point, print_table
+from list3r.cli.common import in_column, parse_point, print_table
 from list3r.cli.terminal import note
 
 if TYPE_CHECKING:
@@ -73,8 +73,6 @@ def _option_error(text: str) -> Exception:
 
 def _check(name: str, arguments: Arguments, signature: inspect.Signature) -> None:
     """Raise `OptionError` for options that only a file can answer."""
-    if asked_at() is not None:
-        raise _option_error("--at is not available for a catalogue; leave it out, or ask the memory file")
     for word, value in arguments.items():
         if word not in _LISTED[name] and value != signature.parameters[word].default:
             flag = word.replace("_", "-")
