@@ -1,4 +1,4 @@
-"""Alignment of two dense reconstructions of 30 shared frames: speed and accuracy next to other ways.
+"""Alignment of two dense reconstructions of 30 shared frames: speed and accuracy compared with other methods.
 
     python benchmarks/alignment.py [--seeds 1,2,3] [--ways ours,vggt_long_double] [--json FILE]
 

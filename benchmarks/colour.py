@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--discovery", default="", help="such as learned,sam2; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
-    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, next to plain pycolmap")
+    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, compared with plain pycolmap")
     parser.add_argument("--hard", action="store_true", help="... with wider turns, and through door frames")
     parser.add_argument("--frames", type=int, help="of each walk; without it 150 of such walks, else all")
     parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")

@@ -207,7 +207,7 @@ def uncertainty(chunks: int, edges: int, seed: int) -> dict[str, Any]:
 
 
 def full(chunks: int, edges: int, seed: int, metric: bool) -> dict[str, Any]:
-    """Plain least squares from the chain, next to gtsam's Levenberg-Marquardt."""
+    """Plain least squares from the chain, compared with gtsam's Levenberg-Marquardt."""
     w = walk(chunks, edges, seed, metric=metric)
     start = chained(w.edges, take(w.truth, np.array(0)))
     u, v = np.array([e.u for e in w.edges]), np.array([e.v for e in w.edges])

@@ -246,7 +246,7 @@ def _without(triples: list[Triple], torn: set[tuple[int, int]], truth_of: dict[i
 
 
 def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
-    """Objects that are with some feet on a rug and with some next to it, neither being the answer; with the rug."""
+    """Objects with some feet on a rug and some next to it, where neither is the answer; with the rug."""
     objects = WalkSettings(seed=seed).world().objects
     torn = set()
     for rug_id, rug in ((t.id, t.box()) for t in objects if t.label == "rug"):

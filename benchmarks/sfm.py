@@ -1,4 +1,4 @@
-"""Colour video without weights: `--reconstruction sfm` next to plain pycolmap of the whole sequence, in one run.
+"""Colour video without weights: `--reconstruction sfm` compared with plain pycolmap of the whole sequence, in one run.
 
     python benchmarks/sfm.py --source ../shared/data/redkitchen --intrinsics 525,525,320,240 --json FILE
 

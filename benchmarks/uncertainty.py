@@ -1,4 +1,4 @@
-"""Whether chunks are where the memory says they do: the share of true positions inside the stated 95 % region.
+"""Whether chunks are where the memory says: the share of true positions inside the stated 95 % region.
 
     python benchmarks/uncertainty.py --presets kidnap,loop --seeds 1,2 --json FILE
 

@@ -186,7 +186,7 @@ class FeedForwardModel:
         return _Reconstructed(reconstruction, shift)
 
     def _errors(self, frames: NDArray[np.int64], seed: list[int]) -> Sim3:
-        """Where the model takes the part of the world that each frame sees to be. Batched (F,)."""
+        """The placement of the part of the world that each frame sees. Batched (F,)."""
         poses = self._settings.poses
         shared = self.covisibility(frames)
         side = sides(shared, poses)

@@ -44,7 +44,7 @@ class BuildingSettings:
 
 @dataclass(frozen=True)
 class PlacedRoom:
-    """A room where it is."""
+    """A room at its place."""
 
     kind: str
     twin: str

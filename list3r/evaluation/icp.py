@@ -53,8 +53,8 @@ def register(
         near = np.isfinite(distance)
         if near.sum() < max(10, settings.least_share * len(p)):
             raise DegenerateError(
-                f"{near.sum()} of {len(p)} points are within {reach:.2f} m of the truth: ICP needs clouds that nearly "
-                "are right; align by --align TRAJECTORY first"
+                f"{near.sum()} of {len(p)} points are within {reach:.2f} m of the truth: ICP needs nearly "
+                "aligned clouds; align by --align TRAJECTORY first"
             )
         step = _step(moved[near], q[row[near]], n[row[near]], reach, with_scale, settings.least_stiffness)
         S = step @ S

@@ -13,7 +13,7 @@ _TOUCH_M = 0.04
 _SHARE = 0.7
 """Share of an object's footprint that is on its support."""
 _LEAST, _TIMES = 4, 2.0
-"""Another axis is up where this many objects are along it, and this many times more than along the stated one."""
+"""Another axis is up where this many objects rest along it, and this many times more than along the stated one."""
 _MOST_OBJECTS = 1500
 
 
@@ -34,7 +34,7 @@ def up_axis_notes(objects: Sequence[NDArray[np.float32]], up: str) -> tuple[str,
 
 
 def _count_resting(boxes: NDArray[np.float64], axis: str) -> int:
-    """Return how many boxes (N, 2, 3) are on a larger one along an axis."""
+    """Return how many boxes (N, 2, 3) rest on a larger one along an axis."""
     k, sign = "xyz".index(axis[-1]), -1.0 if axis.startswith("-") else 1.0
     low, high = np.sort(sign * boxes[:, :, k], axis=1).T
     sides = [j for j in range(3) if j != k]

@@ -80,7 +80,7 @@ class CandidateSettings:
     min_score: float = 0.3
     """Class probability (or predicted quality) times the mean probability inside the mask."""
     max_overlap: float = 0.7
-    """A mask of which a larger share is under better ones is redundant (the ratio that panoptic networks use)."""
+    """A mask with a larger share under better ones is redundant (the ratio that panoptic networks use)."""
     min_area_share: float = 0.0002
     """Of the picture: 60 pixels of 640 x 480."""
     flat_rms: float = 2.0

@@ -30,7 +30,7 @@ class MeshSettings:
     reach_cells: float = 1.6
     """Radius of a point, cells; neighbours on a surface then touch."""
     convex_depth: float = 0.06
-    """A point so deep under the convex hull still is on it: noise, and the roundness of sides."""
+    """A point so deep under the convex hull is still on it: noise, and the roundness of sides."""
     convex_share: float = 0.85
     """With this many points on the hull, the hull is the better mesh: it closes unseen sides with planes."""
     convex_sides: float = 0.6

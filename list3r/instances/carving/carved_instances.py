@@ -144,7 +144,7 @@ class _Change:
 
 
 def _unexplained(place: _Change, nodes: Sequence[LocalNode], explain: Sequence[bool], chunk: ChunkRow) -> list[Array]:
-    """Clusters of surfaces that are gone and that no instance of the chunk represents. Shapes (N, 3)."""
+    """Clusters of surfaces that are gone and that no instance of the chunk explains. Shapes (N, 3)."""
     s, unit, points = place.settings, place.unit, place.gone
     clusters = _clusters(points, unit, s)
     if not clusters:

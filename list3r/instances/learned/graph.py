@@ -265,7 +265,7 @@ def _contact(
 
 
 def _between(stats: _Pieces, left: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How two pieces are to one another. Shape (E, 7)."""
+    """Geometry between two pieces. Shape (E, 7)."""
     way = stats.center[right] - stats.center[left]
     far = np.maximum(np.linalg.norm(way, axis=1), 1e-6)
     n, m = stats.normal[left], stats.normal[right]

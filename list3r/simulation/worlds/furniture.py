@@ -182,7 +182,7 @@ def lamp(height: float, base: Material, shade: Material) -> Parts:
 
 
 def monitor(width: float, frame: Material, screen: Material) -> Parts:
-    """Return a screen on a are."""
+    """Return a screen on a foot."""
     h = width * 0.58
     return (
         block((width * 0.45, 0.18, 0.02), (0, 0, 0.01), frame),
