@@ -21,7 +21,7 @@ def low_confidence_instances(
     """Return the low-confidence segments of a chunk, with local ids from `first_id` on, grouped by `identity`. They are
     seen on anchors alone: tracking them from frame to frame is not worth the time.
     """
-    numbered = [(p, identity_of(p)) for p in proposals if len(p.score)]
+    numbered = [(p, p.identity) for p in proposals if p.identity is not None and len(p.score)]
     if not numbered:
         return ()
     kept, numbers, s = [p for p, _ in numbered], [n for _, n in numbered], settings.low_confidence
@@ -40,9 +40,3 @@ def low_confidence_instances(
             seen = track.record((camera.height, camera.width))
             out.append(LocalInstance(first_id + len(out), seen, feature[number], support, whole[number]))
     return tuple(out)
-
-
-def identity_of(proposals: Proposals) -> NDArray[np.int64]:
-    """Return the object that each candidate is a view of, which its discoverer must know. Shape (N,)."""
-    assert proposals.identity is not None
-    return proposals.identity
