@@ -305,7 +305,7 @@ class Growth:
         return int(rows("SELECT pg_backend_pid()", ())[0][0]) if self._server and rows else 0
 
     def _bytes(self) -> dict[str, int]:
-        """Bytes of the catalogue, and of its largest parts where the database tells them."""
+        """Bytes of the catalogue, and of its largest parts where the database reports them."""
         if self._server is None:
             return {"all": Path(self._url).stat().st_size}
         query = (

@@ -66,7 +66,7 @@ EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "d
 
 
 def exports(*, costly: bool = False) -> list[str]:
-    """Return a command for each format whose package is there, of the costly formats or of the others."""
+    """Return a command for each installed format, of the costly formats or of the others."""
     known = {n: f for n, f in FORMATS.items() if (n in COSTLY) == costly}
     there = {n: f for n, f in known.items() if not f.package or importlib.util.find_spec(f.package)}
     endings = {
@@ -121,7 +121,7 @@ def ask(words: Sequence[str], longest_s: float | None = None, *, serves: bool = 
 
 
 def command_on(memory: Path, command: str, folder: Path) -> list[str]:
-    """Return the words of one of the commands above, about a memory; what it writes goes to a folder, anew."""
+    """Return the words of one of the commands above, about a memory; output goes to a new folder."""
     words = [str(folder / w) if w.startswith("OUT") else w for w in _words(command)]
     for made in (Path(word) for word in words if word.startswith(f"{folder / 'OUT'}") and Path(word).is_dir()):
         shutil.rmtree(made)
@@ -130,9 +130,8 @@ def command_on(memory: Path, command: str, folder: Path) -> list[str]:
 
 
 def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> dict[str, frozenset[str]]:
-    """Run every command about a sound memory: all must answer. Return the tables that each has read of it.
-
-    Makes those that follow as fast as they can be.
+    """Run every command on a sound memory: all must answer. Return the tables that each has read. Later runs are then
+    warm.
     """
     picture.PlanSettings = functools.partial(  # type: ignore[assignment, misc]
         PlanSettings, width_px=400, legend_px=4, min_map_px=50, max_map_px=100
@@ -153,7 +152,7 @@ def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> dict[str, fr
 
 @contextlib.contextmanager
 def checked_once() -> Iterator[None]:
-    """Inside, each table is looked through once and a plan drawn once: for many commands that read one file."""
+    """Inside, each table is checked once and a plan drawn once: for many commands that read one file."""
     known: dict[str, tuple[list[str], Exception | None]] = {}
     plans: dict[str, Image.Image] = {}
     look, draw = read_checks.damage_of, picture.plan_image
@@ -202,7 +201,7 @@ def _tables_read() -> Iterator[set[str]]:
 
 
 def peak_mb() -> int:
-    """Return the most memory that this process had since `_forget_peak`, where the system tells it."""
+    """Return the most memory that this process had since `_forget_peak`, where the system reports it."""
     with contextlib.suppress(OSError):
         found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
         return int(found[1]) // 1024 if found else 0
@@ -215,7 +214,7 @@ def _forget_peak() -> None:
 
 
 def _ready_s() -> float:
-    """Return how long this process had a processor or stood in line for one, where the system tells it."""
+    """Return how long this process had a processor or waited for one, where the system reports it."""
     with contextlib.suppress(OSError):
         had, stood = Path("/proc/self/schedstat").read_text().split()[:2]
         return (int(had) + int(stood)) / 1e9

@@ -1,4 +1,4 @@
-"""The list of what the attack on version 0.1 found, before it was mended and now: by a script in both checkouts."""
+"""Findings of the attack on version 0.1, before the repair and now: by a script in both checkouts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NOT_SHOWN = {
 
 
 def run_list(path: Path | None) -> dict[str, Any]:
-    """Return every finding with what was found before and now; goes on with what the file holds already."""
+    """Return every finding with its results before and now; resumes from the file."""
     held = json.loads(path.read_text(encoding="utf-8")) if path is not None and path.exists() else {}
     if held and held["machine"] != machine():
         raise SystemExit(f"{path} was measured on another machine; name another file")
@@ -80,7 +80,7 @@ def open_rows(message: dict[str, Any]) -> list[str]:
 
 @contextlib.contextmanager
 def _worktree(commit: str) -> Iterator[Path]:
-    """A checkout of a commit beside this one, as long as it is needed."""
+    """A temporary checkout of another commit."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "before"
         git = ["git", "-C", str(HERE), "worktree"]
@@ -92,7 +92,7 @@ def _worktree(commit: str) -> Iterator[Path]:
 
 
 def _looked_for(checkout: Path, names: list[str]) -> Iterator[tuple[str, str]]:
-    """Look for findings in one process, started in the checkout so that its `list3r` is the one that is imported."""
+    """Test findings in one process, started in the checkout so that its `list3r` is imported."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(checkout), str(HERE / "benchmarks")))}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         process = subprocess.Popen(

@@ -49,7 +49,7 @@ class Lie:
     signed: bool
     """Whether checksums are made anew after them."""
     tables: frozenset[str]
-    """What they change; the checksums of signed ones follow."""
+    """Tables they change; the checksums of signed ones follow."""
 
     def __repr__(self) -> str:
         return "; ".join(f"{sql} {tuple(_short(a) for a in arguments)}" for sql, arguments in self.statements)
@@ -57,7 +57,7 @@ class Lie:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows of a table that may lie."""
+    """Rows of a table that may be false."""
 
     name: str
     key: tuple[str, ...]
@@ -67,7 +67,7 @@ class _Rows:
 
     @property
     def touched(self) -> frozenset[str]:
-        """Return the tables that change with it: what follows from instances does."""
+        """Return the tables that change with it: those derived from instances do."""
         return frozenset((self.name, *(UNSIGNED if self.name == "instances" else ())))
 
     def where(self, row: tuple[Any, ...]) -> tuple[str, tuple[Any, ...]]:
@@ -76,7 +76,7 @@ class _Rows:
         return " AND ".join(f"{k} IS ?" for k in self.key), tuple(held[k] for k in self.key)
 
     def values(self, column: str) -> list[Any]:
-        """Return what one column holds."""
+        """Return the values of one column."""
         at = self.columns.index(column)
         return [row[at] for row in self.rows]
 
@@ -91,7 +91,7 @@ def lies(memory: Path) -> st.SearchStrategy[Lie]:
 
 
 def write_lie(base: Path, path: Path, lie: Lie) -> None:
-    """Copy a memory and make it lie; what SQLite itself refuses is no lie, and not tried."""
+    """Copy a memory and make it lie; statements that SQLite refuses are not tried."""
     shutil.copyfile(base, path)
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as database:
         database.execute("PRAGMA synchronous=OFF")
@@ -108,7 +108,7 @@ def write_lie(base: Path, path: Path, lie: Lie) -> None:
 
 
 def sign(database: sqlite3.Connection) -> None:
-    """Make every checksum that of what is there."""
+    """Make every checksum match its rows."""
     database.text_factory = bytes
     for name, blobs in OWN_CRC.items():
         keys = summed_tables()[name].key
@@ -205,7 +205,7 @@ Reported = tuple[str, Any]
 
 
 def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Reported]:
-    """Return what may stand in the place of a value: by kind of lie, as far as the value can tell it."""
+    """Return replacements of a value, by kind of lie where the value's type is known."""
     kinds = {
         "type": st.sampled_from(_TYPES).map(_plain),
         "range": st.sampled_from((*_WHOLES, *_REALS)).map(_plain),
@@ -306,7 +306,7 @@ def _json(draw: st.DrawFn, text: str) -> str:
 
 
 def _places(value: Any) -> Any:
-    """Every value inside a value: what holds it and its key."""
+    """Every value inside a value: its container and its key."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, held in inside:
         yield value, key

@@ -129,7 +129,7 @@ def _carried(free: FreeMap, T_world_cam: Array, xy: Array, yaw: Array, fps: floa
 
 
 def _views(free: FreeMap, T_world_cam: Array, xy: Array) -> int:
-    """How many of the cameras see a place on the floor, as far as walls tell."""
+    """How many of the cameras see a place on the floor, limited by walls."""
     offset = xy - T_world_cam[:, :2, 3]
     away = np.linalg.norm(offset, axis=1)
     along = np.einsum("nk,nk->n", offset, T_world_cam[:, :2, 2])

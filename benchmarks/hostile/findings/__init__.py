@@ -1,1 +1,1 @@
-"""What the attack on version 0.1 found, each as a small script that runs against any checkout of the program."""
+"""Findings of the attack on version 0.1, each a small script that runs against any checkout of the program."""

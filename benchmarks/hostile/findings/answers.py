@@ -71,7 +71,7 @@ def _swallowed(*words: object) -> Callable[[Place], str]:
 
 
 def large_files(place: Place) -> str:
-    """Every question of every damage, in a file of which no table is checked as a whole."""
+    """Every question of every damage, in a file without whole-table checks."""
     for module in list(sys.modules.values()):
         if getattr(module, "WHOLE_BYTES", None):
             module.WHOLE_BYTES = 0  # type: ignore[attr-defined]

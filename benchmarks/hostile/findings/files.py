@@ -109,7 +109,7 @@ def _rested(table: str) -> Callable[[Place], str]:
 
 
 def update_of_a_damaged_memory(place: Place) -> str:
-    """A later session, which writes rows beside the damaged one."""
+    """A later session, which writes rows next to the damaged one."""
     memory, walk = place.folder / "b.l3r", place.walk(frames=12, size=(160, 120))
     words = ("--poses", "given", "--workers", 1)
     built = place.ask("build", walk, "-m", memory, *words, longest_s=120)
@@ -154,7 +154,7 @@ def log_left_is_not_told(place: Place) -> str:
     silent = [c for c in ("verify", "info") if "-wal" not in place.ask(c, memory).message]
     place.ask("repair", memory)
     more = "" if not Path(f"{memory}-wal").exists() else "`repair` does not fold it in"
-    return first(f"{' and '.join(silent)} do not tell of it" if silent else "", more)
+    return first(f"{' and '.join(silent)} do not report it" if silent else "", more)
 
 
 def copy_without_log_is_sound(place: Place) -> str:

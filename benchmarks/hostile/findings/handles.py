@@ -48,7 +48,7 @@ def forked_child(place: Place) -> str:
     other = place.shell("list3r label m.l3r 3 theirs")
     with contextlib.suppress(Exception):
         scene.close()
-    return "another process writes beside the parent" if other.status == 0 else other.bad
+    return "another process writes during the parent's write" if other.status == 0 else other.bad
 
 
 def after_close(place: Place) -> str:
@@ -76,7 +76,7 @@ def _limited(*words: str) -> Callable[[Place], str]:
 
 
 def workers_of_an_ended_parent(place: Place) -> str:
-    """A benchmark with two processes, each at work for longer than is looked, that is ended."""
+    """A benchmark with two busy processes that is ended."""
     return _left_alive(place, place.checkout / "benchmarks/uncertainty.py", "--seeds", "1,2,3,4", "--workers", "2")
 
 

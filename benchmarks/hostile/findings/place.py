@@ -1,7 +1,7 @@
 """The place of a test for a finding: a folder, and the program of this process's checkout.
 
-Uses of the program only what both the old and the present one have: its commands, `list3r.open`, and the small memory
-of its own tests.
+Uses only parts of the program that both the old and the present version have: its commands, `list3r.open`, and the
+small memory of its own tests.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Ended:
 
     @property
     def bad(self) -> str:
-        """Return what no command may do; empty where it did none of it."""
+        """Return violations by a command; empty where there are none."""
         if self.status is None:
             return f"hangs ({self.wall_s:.0f} s)"
         if "Traceback" in self.err:
@@ -59,7 +59,7 @@ class Ended:
         return f"ends by signal {-self.status}" if self.status < 0 else ""
 
     def beyond(self, seconds: float, megabytes: int) -> str:
-        """Return what it took beyond these bounds, or what `bad` says."""
+        """Return its use beyond these bounds, or `bad`."""
         if self.peak_mb > megabytes:
             return f"takes {self.peak_mb} MB" + (f", {self.bad}" if self.bad else "")
         return self.bad or (f"takes {self.cpu_s:.1f} s of a processor" if self.cpu_s > seconds else "")
@@ -134,7 +134,7 @@ class Place:
         )
 
     def do(self, work: Callable[[], Any], longest_s: float = 20.0, limit: Mapping[int, int] | None = None) -> Ended:
-        """Run a function in a child of this process; what it returns is the exit status."""
+        """Run a function in a child of this process; its result is the exit status."""
         importlib.import_module("list3r.cli.app")
         out, err = self.folder / ".out", self.folder / ".err"
         started, child = time.monotonic(), os.fork()
@@ -188,7 +188,7 @@ def _serve(work: Callable[[], Any], out: Path, err: Path, limits: Mapping[int, i
 
 
 def _waited(child: int, end: float) -> tuple[int | None, Any]:
-    """Return the status of a child and what it used; None where it had to be killed."""
+    """Return the status of a child and its resources; None where it had to be killed."""
     while time.monotonic() < end:
         pid, status, used = os.wait4(child, os.WNOHANG)
         if pid:
@@ -206,7 +206,7 @@ def spoil(path: Path, *statements: str) -> None:
 
 
 def lie(path: Path, *statements: str) -> Path:
-    """Change rows, and make every checksum that of what is there."""
+    """Change rows, and make every checksum match."""
     sums = importlib.import_module("list3r.memory.store.checksums")
     words = importlib.import_module("list3r.memory.store.word_index")
     with contextlib.closing(sqlite3.connect(path)) as database, database:

@@ -1,6 +1,6 @@
-"""Look for findings in one checkout, that of `list3r`: `python -m hostile.findings.row FOLDER [KEY ...]`.
+"""Test findings in one checkout, that of `list3r`: `python -m hostile.findings.row FOLDER [KEY ...]`.
 
-Prints a line of JSON for each: its key and what was found, nothing where it holds.
+Prints a line of JSON for each: its key and the result, empty where it holds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def _looked_for(key: str, folder: Path) -> str:
         return ROWS[key](Place(folder, Path(str(list3r.__file__)).parents[1]))[:200]
     except Exception as error:
         traceback.print_exc()
-        return f"cannot be looked for: {type(error).__name__}: {error}"
+        return f"cannot be tested: {type(error).__name__}: {error}"
 
 
 if __name__ == "__main__":

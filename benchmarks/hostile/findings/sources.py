@@ -21,7 +21,7 @@ from hostile.packed import png
 
 
 def _poses(change: Callable[[np.ndarray], None]) -> Callable[[Place], str]:
-    """A folder in the layout of 7-Scenes whose poses are no rigid motions."""
+    """A folder in the layout of 7-Scenes with poses that are no rigid motions."""
 
     def look(place: Place) -> str:
         root = _seven_scenes(place)

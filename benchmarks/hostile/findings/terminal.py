@@ -1,4 +1,4 @@
-"""Findings 10, 11 and 14: waits for readers, what reaches the terminal, and tracebacks."""
+"""Findings 10, 11 and 14: waits for readers, output to the terminal, and tracebacks."""
 
 from __future__ import annotations
 
