@@ -84,11 +84,11 @@ def main() -> None:
             compared = max(1, EVERY // args.every) * args.every
             found = judged(built(walk, kind, args.every), walk, kind, compared)
             rows.append({"kind": kind, "seed": seed, "place": f"{kind}-{seed}", **found})
-            print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
+            print(kind, seed, len(found["instances"]), "instances,", found["true"], "objects", flush=True)
     for walk in args.walks:
         found = judged(walk / "learned.l3r", walk, "walk", EVERY)
         rows.append({"kind": "walk", "seed": walk.name, "place": "-".join(walk.name.split("-")[:2]), **found})
-        print(walk.name, len(found["instances"]), "instances,", found["true"], "things", flush=True)
+        print(walk.name, len(found["instances"]), "instances,", found["true"], "objects", flush=True)
     if args.fit and len({r["kind"] in COMPUTED for r in rows}) != 1:
         parser.error("--fit wants walks that all have a sensor's depth, or all none")
     table = {k: summary([r for r in rows if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}

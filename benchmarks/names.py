@@ -125,7 +125,7 @@ def main() -> None:
     found: dict[str, list[Named]] = {}
     for group, name, make in _samples(words):
         found.setdefault(group, []).append(_kept(words["keep"] / f"{name}.npz", make))
-        print(name, len(found[group][-1].right), "things", flush=True)
+        print(name, len(found[group][-1].right), "objects", flush=True)
     table = {group: summary(rows) for group, rows in found.items()}
     print(machine())
     for group, entry in table.items():

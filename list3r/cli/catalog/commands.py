@@ -139,7 +139,7 @@ def rebuild(
     note(f"{len(entries)} memories; forgot {', '.join(gone) or 'none'}")
 
 
-_HEADER = ("memory", "revision", "things", "file")
+_HEADER = ("memory", "revision", "instances", "file")
 
 
 def _opened(url: str, *, make: bool = False) -> Catalog:

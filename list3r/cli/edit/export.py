@@ -111,7 +111,7 @@ def export(
 @contextlib.contextmanager
 def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Any]]:
     """Show the progress of an export: the option of the formats that report it."""
-    with progress_bar(f"writing {to}", "things", quiet=quiet) as bar:
+    with progress_bar(f"writing {to}", "instances", quiet=quiet) as bar:
         yield {"progress": bar.show} if "progress" in find_format(to).options else {}
 
 
