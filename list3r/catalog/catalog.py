@@ -283,7 +283,7 @@ class Catalog:
         return found
 
     def _end(self, what: int | str | None, memory: str | None) -> Wanted:
-        """Return the memory and instance or words of a subject or an object."""
+        """Return the instances meant by a subject or an object."""
         if what is None:
             return Wanted()
         if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):

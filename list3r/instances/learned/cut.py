@@ -124,8 +124,7 @@ def group(
 
 
 FAR = 3
-"""Doublings of the voxel's size at which parts are neighbours: up to 16 cm between a leg and its table top are
-hidden."""
+"""Doublings of the voxel's size at which parts are neighbours: a view from above hides the top of legs."""
 EXTRA_NODES = 2
 """Columns that `group` adds to the features of pieces and the hidden state: structure and number of pieces."""
 EXTRA_EDGES = 4
