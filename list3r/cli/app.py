@@ -102,7 +102,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 @functools.cache
 def commands(asked: str | None = None) -> Any:
-    """Return the tree of all commands and their options, or the part needed for one command, as the whole takes long."""
+    """Return the tree of all commands and options, or the part for one command, as the whole takes long."""
     app = typer.Typer(
         name="list3r",
         cls=GroupedCommands,
