@@ -200,11 +200,11 @@ def _with_crc(sql: str, table: _Rows) -> str:
 
 # ------------------------------------------------------------------------------------------- other values
 
-Reported = tuple[str, Any]
+Replacement = tuple[str, Any]
 """An expression of SQL with one parameter, and its argument."""
 
 
-def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Reported]:
+def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Replacement]:
     """Return replacements of a value, by kind of lie where the value's type is known."""
     kinds = {
         "type": st.sampled_from(_TYPES).map(_plain),
@@ -225,7 +225,7 @@ def _other(value: Any, column: list[Any]) -> st.SearchStrategy[Reported]:
     return st.sampled_from(sorted(kinds)).flatmap(kinds.__getitem__)
 
 
-def _plain(value: Any) -> Reported:
+def _plain(value: Any) -> Replacement:
     return "?", value
 
 

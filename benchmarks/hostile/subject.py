@@ -38,8 +38,7 @@ FRAMES, POINTS = 6, 80
 
 
 def write_subject(path: Path) -> Path:
-    """Write two sessions of one room with edges, events, votes, labels, non-rigid corrections and edits; a second in
-    all."""
+    """Write two sessions of one room with edges, events, votes, labels, corrections and edits; a second in all."""
     with Store.create(path) as store:
         with store.transaction():
             write_small_room(store, small_picture(), frames=FRAMES, points=POINTS)
