@@ -1,16 +1,17 @@
-"""Alignment of two dense reconstructions of 30 shared frames: speed and accuracy beside other ways.
+"""Alignment of two dense reconstructions of 30 shared frames: speed and accuracy compared with other methods.
 
     python benchmarks/alignment.py [--seeds 1,2,3] [--ways ours,vggt_long_double] [--json FILE]
 
 518 x 378 point maps of a furnished room, noise growing with depth on both sides, 10 % outliers, truth known. `builds`
 is what builds do: samples of each chunk on fixed pixel grids, rounded as they are stored, and the edge between them
-(`measure_edge`). Beside it `ours`, `align_point_maps` on all pixels, which builds do not use, and:
-- the way of VGGT-Long (Deng et al., 2025), written afresh from its description: pixels with a confidence over 0.1 of
-  the smaller median on both sides, weights sqrt(c1 c2), scale from the ratio of the weighted RMS radii, rotation by
-  SVD, five rounds of Huber re-weighting (delta 0.1) over all pairs, in single precision as there;
+(`measure_edge`). Compared with it: `ours`, `align_point_maps` on all pixels, which builds do not use, and:
+- the way of VGGT-Long (Deng et al., 2025), reimplemented from its description: pixels with a confidence over 0.1 of the
+  smaller median on both sides, weights sqrt(c1 c2), scale from the ratio of the weighted RMS radii, rotation by SVD,
+  five rounds of Huber re-weighting (delta 0.1) over all pairs, in single precision as there;
 - the same in double precision (`peers.vggt_long.robust_similarity`): sums over millions of points lose digits;
 - plain weighted Umeyama over all pairs.
-Seconds are CPU seconds of one thread. Outliers are on both sides, or on the second side alone.
+Seconds are CPU seconds of one thread. Outliers are on both sides, or on the
+  second side alone.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ def _observe(
 
 
 def builds(overlap: Overlap) -> Sim3:
-    """What builds do with two chunks that share frames."""
+    """The edge of a build between two chunks that share frames."""
     o, camera = overlap, Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     sides = ((o.depth_u, o.confidence_u, o.T_u_cam), (o.depth_v, o.confidence_v, o.T_v_cam))
     every, frames = np.ones(FRAMES, bool), np.arange(FRAMES)

@@ -4,10 +4,10 @@
     PYTHONPATH=. python benchmarks/aria_frames.py --recording FOLDER --json benchmarks/results/aria-frames.json
 
 FOLDER is data/gen1/aria_digital_twin_test_data of that repository: two pictures with depth (of the twin, without a
-sensor's noise), a thirtieth of a second apart, and with an instance at every pixel. They are one chunk, of poses that
-were recorded. A memory lists nothing that was seen in two frames, so what the chunk found is compared, by masks. Things
-count from 0.2 % of the pixels with depth, 150 px of 320 x 240. Doors and drawers of cupboards, which are parts, and the
-flat itself count neither way, nor does what lies on them for the most part.
+sensor's noise), a thirtieth of a second apart, and with an instance at every pixel. They are one chunk with recorded
+poses. A memory lists no object seen in two frames only, so the chunk's instances are compared, by masks. Objects count
+from 0.2 % of the pixels with depth, 150 px of 320 x 240. Doors and drawers of cupboards, which are parts, and the flat
+itself are ignored, and masks mostly on them.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ SEGMENTS = "400-1"
 SIDE = 640
 """Pictures are compared at this width and height."""
 LEAST_SHARE = 150 / (320 * 240)
-NO_THINGS = ("part of a cabinet/wardrobe", "shelter")
-"""Categories of what is no thing of its own."""
+NO_OBJECTS = ("part of a cabinet/wardrobe", "shelter")
+"""Categories that are no objects of their own."""
 
 
 def main() -> None:
@@ -78,7 +78,7 @@ def true_pictures(recording: Path) -> tuple[dict[int, Ints], dict[int, str]]:
 
 
 def found_masks(memory: Path) -> dict[int, dict[int, NDArray[np.bool_]]]:
-    """Masks of what the chunk found and did not take for structure, by local id and frame."""
+    """Masks of the chunk's instances without structure, by local id and frame."""
     out: dict[int, dict[int, NDArray[np.bool_]]] = {}
     with Store.open(memory) as store:
         for node in store.local_instances.nodes([c.chunk_id for c in store.chunks.all()]):
@@ -94,10 +94,10 @@ def found_masks(memory: Path) -> dict[int, dict[int, NDArray[np.bool_]]]:
 def compared(
     truth: dict[int, Ints], names: dict[int, str], found: dict[int, dict[int, NDArray[np.bool_]]]
 ) -> dict[str, Any]:
-    """Recall and precision by masks, and what is best for each true thing."""
+    """Recall and precision by masks, and the best match of each true object."""
     px = np.sum([np.bincount(t.ravel(), minlength=len(names) + 1) for t in truth.values()], axis=0)
     large = [k for k in names if px[k] >= LEAST_SHARE * SIDE**2]
-    wanted = [k for k in large if names[k] not in NO_THINGS]
+    wanted = [k for k in large if names[k] not in NO_OBJECTS]
     shared = np.zeros((len(found), len(names) + 1), np.int64)
     own = np.zeros(len(found), np.int64)
     for row, masks in enumerate(found.values()):

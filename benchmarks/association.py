@@ -1,33 +1,32 @@
-"""Association on simulated videos with known truth: VGGT-Long's way, the paper's steps, and ours, one row each.
+"""Association on simulated videos with known truth: VGGT-Long, the paper's steps, and ours, one row each.
 
 python benchmarks/association.py --presets kidnap,twins --seeds 1,2,3 --json FILE [--plot FILE]
 python benchmarks/association.py --quick --json FILE        # two presets, two seeds, all rows
 
-A run that was ended goes on where it was when it is started again with the same `--json` and commit.
+An interrupted run resumes with the same `--json` and commit.
 
-The presets opposite, night, alike, moved, halls and seasons are videos in which a place is seen again but looks
-otherwise (`benchmarks.simulation.returns`), with masks as discovery makes them in homes that it never saw. The
-simulated network relates places that share no surface by laying look-alike things on one another, which is right where
-they are the same things; with `--joint surfaces` it relates only what shares surfaces, and else takes the camera not to
-have moved.
+The presets opposite, night, alike, moved, halls and seasons are videos that return to a place of changed appearance
+(`benchmarks.simulation.returns`), with masks as of discovery in unseen homes. The simulated network aligns places
+without shared surface by look-alike objects, which is right where they are the same objects; with `--joint surfaces` it
+aligns only shared surfaces, and else assumes a still camera.
 
-Every video is worked through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction
-model and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video,
-chunks, descriptors and joint windows, and chunks end at cuts in all of them but the first:
+Every video goes through the real pipeline (`mapping.add_chunk` on a real memory file); only the reconstruction model
+and the instance tracker are simulated (`benchmarks.feedforward_sim.feedforward`). All rows get the same video, chunks,
+descriptors and joint windows, and chunks end at cuts in all of them but the first:
 
 - vggt-long: as published, `benchmarks/peers/vggt_long.py`, which detects no cuts;
 - vggt-long-cuts: the same on chunks that end at cuts;
-- ilrd-paper: loops accepted by s_loop alone, as the paper writes it, `benchmarks/peers/paper_loops.py`;
+- ilrd-paper: loops accepted by s_loop alone, as in the paper, `benchmarks/peers/paper_loops.py`;
 - verified: loops proposed by frame similarity and verified by geometry, no instance anywhere;
-- ilrd: + instances rank candidates and object to relations;
-- iasm-paper: instance-aware merging as the paper writes it, `benchmarks/peers/paper_support.py`: instances whose
-  delta(o) is large leave, and the support is sampled by confidence and coverage;
-- iasm: instance-aware support as builds have it in its place;
+- ilrd: + instances rank candidates and reject relations;
+- iasm-paper: instance-aware merging as in the paper, `benchmarks/peers/paper_support.py`: instances with a large
+  delta(o) are removed, and the support is sampled by confidence and coverage;
+- iasm: the instance-aware support of builds instead;
 - cwgo-paper: iasm with the paper's weights of edges in the graph;
-- graph: iasm with covariances as weights and loops that can be switched off;
-- full: + nodes within chunks, what builds use;
+- graph: iasm with covariances as weights and switchable loops;
+- full: + nodes within chunks, as in builds;
 - full-no-instances: full with all instance evidence off (no `s_sem` and `s_rel`, no layout, no kinds, no registration
-  by things): what instances are worth is the difference of the two.
+  by objects): the difference of the two is the value of instances.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ TITLES = {
 }
 VARIANTS = tuple(TITLES)
 FALSE_M = 0.5
-"""A loop whose relation puts a camera further off than this is false; chunks bend by a few centimetres."""
+"""A loop with a camera error above this is false; chunks are deformed by a few centimetres."""
 SHOWN = ("ate_sim3_m", "rte_m", "rre_deg", "completeness_cm", "chamfer_cm", "f_at_5cm", "false_loops", "worst_loop_m")
 
 
@@ -116,7 +115,7 @@ def _resumed(path: Path | None) -> list[dict[str, Any]]:
 
 
 def _plain_judgement(judged: Any) -> dict[str, Any]:
-    """What is true of the candidates of a video, for JSON."""
+    """Ground truth of the candidates of a video, for JSON."""
     c = judged.candidates
     return {
         "chunks": c.chunks.tolist(),
@@ -292,7 +291,7 @@ class _Truth:
         self._covisibility = Covisibility(rows, video.time_s[rows], seen_share(video, rows, rows, most_deg or MOST_DEG))
 
     def measure(self, store: Any) -> dict[str, Any]:
-        """Errors of all frames in the one frame of the memory: parts that were not joined count as they lie."""
+        """Errors of all frames in the one frame of the memory: parts that were not joined count as they are."""
         from list3r.evaluation.cloud import evaluate_cloud
         from list3r.evaluation.revisits import Candidates, judge, score
         from list3r.evaluation.trajectory import Trajectory, align, evaluate_trajectory
@@ -345,7 +344,7 @@ class _Truth:
         return float(np.linalg.norm(error))
 
     def _placed(self, samples: Any, frame: int) -> Any:
-        """The similarity from a chunk to the truth by what it saw within ten frames of one; None with too little."""
+        """The similarity from a chunk to the truth, by its points within ten frames of one; None with too few."""
         from list3r.memory.errors import DegenerateError
         from list3r.memory.geometry import umeyama
 
@@ -366,7 +365,7 @@ class _Truth:
 
 
 def _right_is_no_error(labels: NDArray[np.int8], chunks: NDArray[np.int64], errors_m: Array) -> NDArray[np.int8]:
-    """A pair of chunks that share hardly a view, but of which a measured relation is right, counts neither way."""
+    """Pairs of chunks with hardly a shared view but a correct measured relation are ignored."""
     from list3r.evaluation.revisits import FALSE, OPEN
 
     pairs = np.sort(chunks, axis=1)
@@ -389,7 +388,7 @@ def _moved(S: Any, poses: Array) -> Array:
 
 
 def _points(store: Any) -> Array:
-    """Points where the frames that saw them lie, the bending of chunks undone."""
+    """Points where the frames that saw them are, the bending of chunks undone."""
     from list3r.memory.geometry import Sim3
 
     parts, bends = [], store.bends.all()
@@ -448,7 +447,7 @@ def print_tables(summary: dict[str, Any], presets: Sequence[str], variants: Sequ
 def revisit_table(
     judgements: Sequence[tuple[str, str, Any]], presets: Sequence[str], variant: str
 ) -> dict[str, dict[str, Any]]:
-    """Pairs of chunks found again: what one variant accepts, and frame similarity alone at its best threshold of
+    """Recognised pairs of chunks: those accepted by one variant, and by frame similarity alone at its best threshold of
     precision 0.99, with the same descriptors; pooled over the seeds and over all presets."""
     from list3r.evaluation.revisits import score
 

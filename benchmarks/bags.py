@@ -1,12 +1,11 @@
-"""A large recording of a robot, read from end to end: how fast, and in how much memory.
+"""Speed and memory of reading a large recording of a robot.
 
 python benchmarks/bags.py --gigabytes 1 --json benchmarks/results/bags.json
 
 Raw pictures and depth of 640 x 480 with a camera and `/tf`, interleaved by time, are written by `rosbags` as mcap and
-db3, as mcap whose chunks are packed (`-zstd`), and as a bag of ROS 1 packed by LZ4. A process of its own opens the
-recording and reads all frames; the disk's own speed is that of reading the file's bytes just before (it may lie in the
-system's cache both times). Speeds by processor time say what the reader costs on a machine that is busy with other
-work.
+db3, as mcap with compressed chunks (`-zstd`), and as a bag of ROS 1 compressed by LZ4. A separate process opens the
+recording and reads all frames; the disk's own speed is that of reading the file's bytes just before (it may be in the
+system's cache both times). Speeds by processor time are the reader's cost on a busy machine.
 """
 
 from __future__ import annotations
@@ -114,7 +113,7 @@ def write(path: Path, kind: str, frames: int) -> Path:
 
 
 def writer_of(path: Path, kind: str) -> Any:
-    """Return what writes a kind of recording."""
+    """Return the writer of a kind of recording."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 

@@ -2,8 +2,8 @@
 
 python benchmarks/batch.py --engines local ray --json benchmarks/results/batch.json
 
-Processor seconds are those of the command and all that it starts, looked at twice a second: what a process spent after
-it was last seen is not in them.
+Processor seconds are those of the command and its children, sampled twice a second: time of a process after its last
+sample is not counted.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main() -> None:
     words.add_argument("--frames", type=int, default=6)
     words.add_argument("--size", type=int, nargs=2, default=(160, 120))
     words.add_argument("--engines", nargs="+", default=["local"], choices=["local", "ray"])
-    words.add_argument("--runs", nargs="+", help="Only these, beside what --json holds already; one-process first.")
+    words.add_argument("--runs", nargs="+", help="Only these, in addition to the runs in --json; one-process first.")
     words.add_argument("--worker-kills", type=int, default=20)
     words.add_argument("--driver-kills", type=int, default=2)
     words.add_argument("--seed", type=int, default=1)
@@ -51,9 +51,9 @@ def main() -> None:
         "frames": asked.frames,
     }
     result |= {"size": list(asked.size), "runs": runs}
-    told = asked.json or asked.folder / "batch.json"
-    if asked.runs and told.exists():
-        runs |= json.loads(told.read_text())["runs"]
+    report = asked.json or asked.folder / "batch.json"
+    if asked.runs and report.exists():
+        runs |= json.loads(report.read_text())["runs"]
     print(f"{asked.videos} videos of {asked.frames} frames and one file that is no video")
     reference: dict[str, str] | None = None
     for name, engine, jobs in _runs(asked.engines):
@@ -68,14 +68,14 @@ def main() -> None:
             found = _run(command, out, kills, random.Random(asked.seed))
         hashes = _hashes(out)
         reference = reference or hashes
-        found |= {"files": len(hashes), "equal": hashes == reference, **_told(out)}
+        found |= {"files": len(hashes), "equal": hashes == reference, **_report(out)}
         runs[name] = found
         print(name, json.dumps(found), flush=True)
-        write_json(told, result)
+        write_json(report, result)
 
 
 def _runs(engines: list[str]) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield name, engine and further options of each run; the first is what the others are compared with."""
+    """Yield name, engine and further options of each run; the first is the reference."""
     yield "one-process", "local", ["--jobs", "1"]
     for engine in engines:
         yield engine, engine, []
@@ -96,7 +96,7 @@ def _videos(folder: Path, asked: argparse.Namespace) -> Path:
 
 
 def _run(command: list[str], out: Path, kills: tuple[int, int], chance: random.Random) -> dict[str, object]:
-    """Run the command until it ends by itself, ending its workers and itself at random meanwhile."""
+    """Run the command until it finishes, killing its workers and itself at random meanwhile."""
     workers_left, drivers_left = kills
     began, runs, first_seen, rewritten = time.monotonic(), 0, dict[str, int](), set[str]()
     before, spent = _spent(), dict[int, float]()
@@ -159,8 +159,8 @@ def _hashes(out: Path) -> dict[str, str]:
     return {p.name: file_hash(p) for p in sorted(out.glob("*.l3r"))}
 
 
-def _told(out: Path) -> dict[str, object]:
-    """What the manifest says: tasks by state, and how often any was built."""
+def _report(out: Path) -> dict[str, object]:
+    """The manifest: tasks by state, and how often any was built."""
     with contextlib.closing(sqlite3.connect(out / "batch.sqlite")) as database:
         states = dict(database.execute("SELECT state, count(*) FROM tasks GROUP BY state").fetchall())
         attempts = dict(database.execute("SELECT outcome, count(*) FROM attempts GROUP BY outcome").fetchall())

@@ -1,14 +1,13 @@
-"""The main job by two versions of the program, in turns on one machine: how many times as fast, and whether as good.
+"""A build by two versions of the program, in turns on one machine: ratio of speed, and quality.
 
     git worktree add --detach ../before 3aa3245
     PYTHONPATH=. python benchmarks/build_pair.py --before ../before --source ../shared/data/redkitchen --json FILE
     PYTHONPATH=. python benchmarks/build_pair.py --before ../before --source ../shared/data/redkitchen \\
         --colour-only --intrinsics 525,525,320,240 --json FILE
 
-Each version builds the same pictures with two workers, once unmeasured on a few frames, so that its machine code is
-compiled, then `--rounds` times. Both memories are opened by this version. Times are of the whole program, from its
-start to its end. Frames per second of different machines cannot be compared; what one version takes by what the other
-takes in the same run can.
+Each version builds the same pictures with two workers, once on a few frames for warm-up, then `--rounds` times. Both
+memories are opened by this version. Times are of the whole program, from its start to its end. Frames per second of
+different machines cannot be compared; the ratio of two versions in one run can.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ def _figures(memory: Path, source: Path, truth: Trajectory | None, count: int) -
     exported = memory.with_suffix(".json")
     with open_memory(memory) as opened:
         opened.export("json", str(exported))
-    things = [e for e in read_scene(exported)["instances"] if not e["structure"]]
+    objects = [e for e in read_scene(exported)["instances"] if not e["structure"]]
     with Store.open(memory) as store:
         poses = {f.frame_index: (S.rotation, S.translation) for f, S in store.trajectory.poses()}
     if truth is None:
@@ -104,7 +103,7 @@ def _figures(memory: Path, source: Path, truth: Trajectory | None, count: int) -
         error = errors["ate_se3_m"]["rmse"]
     else:
         error = sim3_error(truth, poses)
-    return {"frames": count, "posed": len(poses), "ate_m": round(error, 5), "instances": len(things)}
+    return {"frames": count, "posed": len(poses), "ate_m": round(error, 5), "instances": len(objects)}
 
 
 def _commit(root: Path) -> str:

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 DRAWS = 200
-"""Draws by which the error that chance alone makes is told."""
+"""Samples for estimating the error by chance alone."""
 
 
 def calibration(probability: NDArray[np.float64], right: NDArray[np.bool_], bins: int = 10) -> dict[str, float]:
-    """Return the expected calibration error, and the share right of the surest 0.6 and 0.8 and of all.
-
-    `ece_by_chance` is what the error would be on average were all probabilities right: few samples never agree.
+    """Return the expected calibration error, and the precision of the surest 0.6 and 0.8 and of all. `ece_by_chance` is
+    the mean error if all probabilities were right: it is not 0 for few samples.
     """
     bin_of = np.clip((probability * bins).astype(int), 0, bins - 1)
     rng = np.random.default_rng(0)

@@ -1,12 +1,12 @@
-"""A catalogue of many memories as it grows: what loading, adding a memory and asking costs, how many of the nearest
-vectors are found, many at once, a server that is killed, and the catalogue written anew from files.
+"""A growing catalogue of many memories: cost of loading, adding a memory and queries, recall of the nearest vectors,
+concurrent clients, a killed server, and rebuilding from files.
 
 python benchmarks/catalog.py --postgres --busy-s 300 --json benchmarks/results/catalog.json
 python benchmarks/catalog.py --stages 5,50 --json catalog-sqlite.json        # the embedded catalogue
 
-The server is the benchmark's own, from the distribution's package with pgvector. Memories are made up and handed to the
-catalogue as the reader of files does; `--files` of them are real files. Wall times hold for a machine of its own alone:
-beside them stands processor time, of this process and of the server's that answers it.
+The server is the benchmark's own, from the distribution's package with pgvector. Memories are synthetic and passed in
+as the reader of files does; `--files` of them are real files. Wall times are valid on an idle machine only; processor
+time, of this process and of its server process, is given too.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from list3r.catalog.records import (
     CatalogAnswers,
     CatalogError,
     CatalogFilters,
-    CatalogThing,
+    CatalogInstance,
     MemoryContent,
     MemoryEntry,
     SpaceVectors,
@@ -47,10 +47,9 @@ SPACES = {
     "benchmark even@1/{}": (0.0, 3000),
     "benchmark lone@1/{}": (1.0, 0),
 }
-"""Vectors, by how their variances fall and how many kinds of look there are. Of learned ones the variance of the n-th
-number is about 1 / n (Agrawal et al. 2022, alpha-ReQ), and things of one kind lie together: the first. Beside it such
-as vary alike in all directions, in which a graph of neighbours loses its way, and such as lie nowhere together, which
-lists divide badly."""
+"""Vectors, by the decay of their variances and the number of clusters of appearance. Of learned ones the variance of
+the n-th number is about 1 / n (Agrawal et al. 2022, alpha-ReQ), with clusters: the first. The others are isotropic,
+hard for a graph index, and without clusters, hard for inverted lists."""
 COLORS = ("red", "blue", "green", "white", "black", "grey", "brown", "yellow")
 KINDS = tuple(f"kind{n}" for n in range(400))
 SERVER = "-c shared_buffers=2GB -c max_wal_size=4GB -c max_parallel_maintenance_workers=0"
@@ -65,7 +64,7 @@ def main() -> None:
     words.add_argument("--instances", type=int, default=2000)
     words.add_argument("--dimension", type=int, default=64)
     words.add_argument("--questions", type=int, default=200)
-    words.add_argument("--files", type=int, default=5, help="Real files that are taken in, and anew.")
+    words.add_argument("--files", type=int, default=5, help="Real files that are added, and rebuilt.")
     words.add_argument("--busy-s", type=float, default=0.0, help="So long 16 ask while 4 write.")
     words.add_argument("--json", type=Path)
     asked = words.parse_args()
@@ -84,38 +83,38 @@ def _started(postgres: bool) -> Iterator[tuple[str, PostgresServer | None]]:
 
 
 class Growth:
-    """A catalogue that grows from stage to stage, and what was measured."""
+    """A catalogue that grows from stage to stage, and its measurements."""
 
     def __init__(self, url: str, server: PostgresServer | None, asked: argparse.Namespace) -> None:
         self._url, self._server, self._asked = url, server, asked
         self._chance = np.random.default_rng(1)
-        self._looks = {
-            name.format(asked.dimension): Looks(asked.dimension, *how, self._chance) for name, how in SPACES.items()
+        self._clusters = {
+            name.format(asked.dimension): Clusters(asked.dimension, *how, self._chance) for name, how in SPACES.items()
         }
-        self._space, self._even, self._lone = self._looks
+        self._space, self._even, self._lone = self._clusters
         self._vectors: list[list[Vectors]] = []
         self._backend = open_backend(url)
         self._catalog = Catalog(self._backend)
-        told = ("instances", "dimension", "questions")
+        report = ("instances", "dimension", "questions")
         self._result: dict[str, Any] = {"database": "PostgreSQL" if server else "SQLite", "stages": []}
-        self._result |= {"a_memory": {name: getattr(asked, name) for name in told}}
+        self._result |= {"a_memory": {name: getattr(asked, name) for name in report}}
 
     def run(self) -> None:
         for count in map(int, self._asked.stages.split(",")):
             self._result["stages"].append(self._stage(count))
-            self._told()
+            self._report()
         if self._asked.files:
             self._result["from_files"] = self._from_files()
-            self._told()
+            self._report()
         if self._asked.busy_s:
             self._result["busy"] = self._busy()
-            self._told()
+            self._report()
         if self._server is not None:
             self._result["killed"] = self._killed(self._server)
-            self._told()
+            self._report()
         self._catalog.close()
 
-    def _told(self) -> None:
+    def _report(self) -> None:
         print(list(self._result.items())[-1], "load", round(os.getloadavg()[0], 1), flush=True)
         write_json(self._asked.json, self._result)
 
@@ -126,7 +125,7 @@ class Growth:
         with _spent(server) as spent, self._catalog.loading(missing):
             for n in range(len(self._vectors), count):
                 began = time.process_time()
-                content = make_content(f"m{n:05d}", self._asked.instances, self._looks, self._chance)
+                content = make_content(f"m{n:05d}", self._asked.instances, self._clusters, self._chance)
                 made += time.process_time() - began
                 self._vectors.append([held.vectors.astype(np.float16) for held in content.spaces])
                 self._backend.put(content)
@@ -143,9 +142,9 @@ class Growth:
         return row
 
     def _put(self, server: int) -> dict[str, float]:
-        """Add a memory of 1,000 three times, each of other things."""
-        looks = {self._space: self._looks[self._space]}
-        contents = [make_content(f"small{n}", 1000, looks, self._chance) for n in range(3)]
+        """Add a memory of 1,000 three times, each of other objects."""
+        clusters = {self._space: self._clusters[self._space]}
+        contents = [make_content(f"small{n}", 1000, clusters, self._chance) for n in range(3)]
         found = _timed(lambda n: self._backend.put(contents[n]), 3, server, warm=0)
         for content in contents:
             self._backend.drop(content.entry.name)
@@ -176,11 +175,11 @@ class Growth:
         }
 
     def _alike(self, space: str, n: int) -> CatalogAnswers:
-        return self._catalog.similar(vector=self._looks[space].near(n), space=space, k=10)
+        return self._catalog.similar(vector=self._clusters[space].near(n), space=space, k=10)
 
     def _recall(self, space: str, number: int) -> float:
         """Share of the true ten that are found, over 50 questions."""
-        size, queries = self._asked.instances, np.array([self._looks[space].near(n) for n in range(50)])
+        size, queries = self._asked.instances, np.array([self._clusters[space].near(n) for n in range(50)])
         cosine = np.concatenate([queries @ v[number].astype(np.float32).T for v in self._vectors], axis=1)
         hits = 0
         for n, best in enumerate(np.argpartition(-cosine, 10, axis=1)[:, :10].tolist()):
@@ -189,7 +188,7 @@ class Growth:
         return hits / 500
 
     def _from_files(self) -> dict[str, Any]:
-        """Real files are taken in, asked, written anew and asked again."""
+        """Real files are added, queried, rewritten and queried again."""
         size, names = self._asked.instances, [f"file{n}" for n in range(self._asked.files)]
         with tempfile.TemporaryDirectory() as folder:
             paths = [Path(folder) / f"{name}.l3r" for name in names]
@@ -237,7 +236,7 @@ class Growth:
                 began = time.perf_counter()
                 try:
                     if writes:
-                        backend.put(make_content(f"busy{number}", 200, self._looks, chance))
+                        backend.put(make_content(f"busy{number}", 200, self._clusters, chance))
                     else:
                         self._one(Catalog(backend), chance)
                 except Exception as error:
@@ -262,7 +261,7 @@ class Growth:
         n = int(chance.integers(1_000_000))
         near = catalog.nearest(self._name(n), point=chance.uniform(0, 10, 3), k=10)
         named = catalog.find(KINDS[n % 400], k=10)
-        alike = catalog.similar(vector=self._looks[self._space].near(n), space=self._space, k=10)
+        alike = catalog.similar(vector=self._clusters[self._space].near(n), space=self._space, k=10)
         if len(near) != 10 or not named or len(alike) != 10:
             raise CatalogError(f"answers are missing: {len(near)}, {len(named)}, {len(alike)}")
 
@@ -276,7 +275,7 @@ class Growth:
             return [*near, *alike, self._catalog.memories()]
 
         before, said = answers(), list[str]()
-        content = make_content("cut off", 20_000, self._looks, self._chance)
+        content = make_content("cut off", 20_000, self._clusters, self._chance)
 
         def write() -> None:
             backend = open_backend(self._url)
@@ -307,7 +306,7 @@ class Growth:
         return int(rows("SELECT pg_backend_pid()", ())[0][0]) if self._server and rows else 0
 
     def _bytes(self) -> dict[str, int]:
-        """Bytes of the catalogue, and of its largest parts where the database tells them."""
+        """Bytes of the catalogue, and of its largest parts where the database reports them."""
         if self._server is None:
             return {"all": Path(self._url).stat().st_size}
         query = (
@@ -323,8 +322,8 @@ class Growth:
         return f"m{n * 7919 % len(self._vectors):05d}"
 
 
-class Looks:
-    """Vectors of one space: things about some kinds of look, or each of a look of its own where there are none."""
+class Clusters:
+    """Vectors of one space: objects in clusters of appearance, or each by itself without clusters."""
 
     def __init__(self, dimension: int, decay: float, kinds: int, chance: np.random.Generator) -> None:
         """Let the variance of the n-th number be n to the power of -decay."""
@@ -332,11 +331,11 @@ class Looks:
         self._kinds = chance.normal(size=(kinds, dimension)) * self._spread if kinds else np.zeros((1, dimension))
 
     def of(self, count: int, chance: np.random.Generator) -> Vectors:
-        """Return the vectors of so many things, of unit length."""
+        """Return the vectors of so many objects, of unit length."""
         return self._about(chance.integers(0, len(self._kinds), count), chance)
 
     def near(self, number: int) -> Vectors:
-        """Return the vector of a thing, the same for the same number."""
+        """Return the vector of an object, the same for the same number."""
         return self._about(np.array([number % len(self._kinds)]), np.random.default_rng(number))[0]
 
     def _about(self, kinds: NDArray[np.int64], chance: np.random.Generator) -> Vectors:
@@ -344,16 +343,16 @@ class Looks:
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
 
 
-def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.random.Generator) -> MemoryContent:
-    """A memory of things of random places, names, looks and relations."""
+def make_content(name: str, count: int, clusters: dict[str, Clusters], chance: np.random.Generator) -> MemoryContent:
+    """A memory of objects with random places, names, appearances and relations."""
     centers, sizes = chance.uniform(0, 10, (count, 3)), chance.uniform(0.05, 0.8, (count, 3))
     kinds, colors = chance.integers(0, 400, count), chance.integers(0, 8, count)
-    things = []
+    instances = []
     for n in range(count):
         label, color = KINDS[kinds[n]], COLORS[colors[n]]
         box = OrientedBox(centers[n], sizes[n], np.eye(3))
-        told = (label, f"{color} box, 20 cm", "present", None, float(chance.uniform(0.3, 1.0)), 0.01, 1, box)
-        things.append(CatalogThing(name, n, *told, {label: 100, kind_word(label): 100, color: 90, "box": 80}))
+        report = (label, f"{color} box, 20 cm", "present", None, float(chance.uniform(0.3, 1.0)), 0.01, 1, box)
+        instances.append(CatalogInstance(name, n, *report, {label: 100, kind_word(label): 100, color: 90, "box": 80}))
     pairs = chance.integers(0, count, (2 * count, 2))
     relations = [
         (int(a), "on" if k % 2 else "near", int(b), 0.8, 0.1) for k, (a, b) in enumerate(np.unique(pairs, axis=0))
@@ -361,8 +360,8 @@ def make_content(name: str, count: int, looks: dict[str, Looks], chance: np.rand
     entry = MemoryEntry(
         name, f"/nowhere/{name}.l3r", 0, f"{chance.integers(2**60):x}", 1, 0, "metric", "known", count, 1
     )
-    spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in looks.items()]
-    return MemoryContent(entry, things, relations, spaces)
+    spaces = [SpaceVectors(space, np.arange(count), held.of(count, chance)) for space, held in clusters.items()]
+    return MemoryContent(entry, instances, relations, spaces)
 
 
 @contextlib.contextmanager

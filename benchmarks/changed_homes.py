@@ -2,16 +2,15 @@
 
 python benchmarks/changed_homes.py --seeds 401-420 --keep FOLDER --json benchmarks/results/changed-homes.json
 
-A room of a home is filmed with a sensor's depth, 320 x 240 (`HomeSessionWalk`). Then half of what stands on its floor
-or on its furniture is put elsewhere in the room, the light changes (`EVENING`), and the room is filmed again from
-near the same places. `list3r build` makes a memory of the first walk, `list3r update` adds the second. A session
-counts as placed where all its chunks lie in the world of the first and its cameras are off by at most 0.1 m and 3
-degrees (medians) when the world is laid on the truth by the cameras of the first session alone, turned by their mean
-rotation. With --reconstruction sfm both memories are made from colour alone, and the cameras of the first session give
-the scale as well. What stands in the JSON already is not done again, and walks and memories in --keep are used as they
-are.
-With --other-homes the second session of each next home is added to the memory of a home in --keep, where it must stay
-apart.
+A room of a home is filmed with a sensor's depth, 320 x 240 (`HomeSessionWalk`). Then half of the objects on its floor
+and furniture are moved within the room, the light changes (`EVENING`), and the room is filmed again from near the same
+places. `list3r build` makes a memory of the first walk, `list3r update` adds the second. A session counts as placed
+where all its chunks are in the world of the first and its cameras are off by at most 0.1 m and 3 degrees (medians)
+after alignment of the world with the truth by the cameras of the first session alone, with their mean rotation. With
+--reconstruction sfm both memories are made from colour alone, and the cameras of the first session give the scale as
+well. Results in the JSON are not repeated, and walks and memories in --keep are reused. With
+--other-homes the second session of each next home is added to the memory of a home in --keep, where it must not be
+placed.
 """
 
 from __future__ import annotations
@@ -113,9 +112,8 @@ def _pairs(store: Store, session: int, truth: Trajectory) -> tuple[Array, Array]
 
 
 def offset(first: tuple[Array, Array], second: tuple[Array, Array], *, with_scale: bool) -> tuple[float, float]:
-    """Return the medians of metres and degrees by which cameras of the second session lie off.
-
-    Rotations of the first session lay the world on the truth: short ways with little motion leave a turn about them.
+    """Return the median errors of the second session's cameras, metres and degrees. Rotations of the first session
+    align the world with the truth: short paths leave a rotation about themselves uncertain.
     """
     R = Rotation.from_matrix([t[:3, :3] @ w[:3, :3].T for w, t in zip(*first, strict=True)]).mean().as_matrix()
     spread = [np.linalg.norm(np.std(T[:, :3, 3], axis=0)) for T in first]
@@ -146,14 +144,14 @@ def other_homes(keep: Path, seeds: Sequence[int]) -> dict[str, Any]:
 
 
 def _between_sessions(store: Store) -> list[dict[str, Any]]:
-    """The candidate relations between the two sessions: what they stand on and what became of them."""
+    """The candidate relations between the two sessions: support and outcome."""
     session = {c.chunk_id: c.session_id for c in store.chunks.all()}
     found = [e for e in store.edges.all() if session[e.u] != session[e.v]]
     return [{"accepted": e.accepted, "reason": e.reason[:160]} for e in found]
 
 
 def total(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many sessions are in their place, and how many in a wrong one, with those placed in part."""
+    """Numbers of correctly and wrongly placed sessions, including partial placements."""
     said = [r for r in rows if r["in_world"]]
     off = [r["off_m"] for r in said]
     return {

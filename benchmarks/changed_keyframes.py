@@ -4,9 +4,9 @@ python benchmarks/changed_keyframes.py --seeds 441-460 --json benchmarks/results
 
 The homes and walks of `changed_homes.py`, of which only every --every-th frame is rendered and taken as a keyframe at
 its true pose, so that a home costs seconds. All keyframes of the second session are compared with all of the first one
-(`place_by_all_keyframes`, nothing else), and with those of the home before, and the other way round: strangers, which
-must never be placed. Right means that the cameras of the first session lie within 0.1 m and 3 degrees (medians) of
-where they are. `rule_of_two` is what two relations that agree would place alone: right, wrong or not at all.
+(`place_by_all_keyframes`, nothing else), and with those of the previous home, and the reverse: strangers, which must
+never be placed. Right means that the cameras of the first session are within 0.1 m and 3 degrees (medians) of where
+they are. `rule_of_two` is the placement by two agreeing relations alone: right, wrong or none.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _placed(first: list[Keyframe], second: list[Keyframe]) -> list[Edge]:
 
 
 def _judged(home: Sessions) -> dict[str, Any]:
-    """What becomes of the second session."""
+    """Outcome of the second session."""
     found = _placed(*home)
     pairs = [verify(a, b, 1, 2, later=True) for a, b in itertools.product(*home)]
     accepted = [e for e in pairs if e.accepted]

@@ -1,14 +1,14 @@
-"""What changed between two visits, told in homes that the simulator of `sessions.py` did not make.
+"""Change detection between two visits, in homes from another source than the simulator of `sessions.py`.
 
 PYTHONPATH=. python benchmarks/changes_elsewhere.py --seeds 7001-7006 --keep FOLDER --json FILE
 PYTHONPATH=. python benchmarks/changes_elsewhere.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-4
 
 Worlds and house are those of `discovery.py`, filmed twice with a sensor's depth; the second walk goes the other way
-round. In between up to two things each are moved, removed and added, drawn from what two people can carry, what carries
-nothing and is seen on the way; what is moved stands on the floor or on a thing. `list3r build` makes a memory of the
-first walk from unknown poses, `list3r update` adds the second. What counts is told in `sessions.py`, which measures it,
-but for this: a change is due only where the second walk could see it (`known_places.py`), and what was not carried has
-not moved, though its box is that of another side.
+round. In between up to two objects each are moved, removed and added, drawn from seen objects that two people can carry
+and that support nothing; moved objects end on the floor or on another object. `list3r build` makes a memory of the
+first walk from unknown poses, `list3r update` adds the second. Scoring is that of `sessions.py`, except: a change is
+due only where the second walk could see it (`known_places.py`), and an object counts as moved only if it was moved, not
+if its box shows another side.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from training.worlds.gazebo import film_house, house_extents
 Array = NDArray[np.float64]
 FRAMES = 120
 PROBE = 8
-"""Every n-th frame of the way is looked at to draw what is changed."""
+"""Every n-th frame is used to draw the changes."""
 LEAST_PX = 300
-"""Pixels of a view from which a thing may be changed."""
+"""Pixels of a view from which an object may be changed."""
 MOST_M = 2.0
-"""Longest edge of what is carried."""
+"""Longest edge of a moved object."""
 EACH = 2
-"""Things that are moved, removed, added."""
+"""Objects that are moved, removed, added."""
 
 Filmer = Callable[[Visit, int, int], Film]
 """Films a visit with so many frames, every n-th of the way."""
@@ -101,12 +101,12 @@ def film_twice(root: Path, seed: int, house: Path | None) -> None:
 def drawn(
     extents: Mapping[int, Array], probe: Film, rng: np.random.Generator
 ) -> tuple[dict[int, Array], list[int], list[int]]:
-    """Return what is moved (id and shift, metres), removed and added, of what a probe of the way shows."""
+    """Return the moved (id and shift, metres), removed and added objects, drawn from those seen on the way."""
     largest = {k: int(max((probe.ids == k).sum(axis=(1, 2)))) for k in extents}
     free = [k for k, e in extents.items() if largest[k] >= LEAST_PX and _can_be_carried(k, e, extents)]
     order = [free[n] for n in rng.permutation(len(free)).tolist()]
     removed, added, moved = order[0::3][:EACH], order[1::3][:EACH], {}
-    for k in (k for k in order if k not in removed and k not in added and _stands(k, extents)):
+    for k in (k for k in order if k not in removed and k not in added and _is_supported(k, extents)):
         others = {n: e for n, e in extents.items() if n != k and n not in removed}
         shift = _shift(k, extents[k], others, moved, probe, rng)
         if shift is not None and len(moved) < EACH:
@@ -123,13 +123,13 @@ def _can_be_carried(k: int, extent: Array, extents: Mapping[int, Array]) -> bool
     return not any(inside[n] and low[2] + 0.02 < extents[n][0, 2] < high[2] + 0.05 for n in middle)
 
 
-def _stands(k: int, extents: Mapping[int, Array]) -> bool:
+def _is_supported(k: int, extents: Mapping[int, Array]) -> bool:
     others = {n: e for n, e in extents.items() if n != k}
     return bool(extents[k][0, 2] < 0.05) or _support(extents[k], others) is not None
 
 
 def _support(extent: Array, others: Mapping[int, Array]) -> int | None:
-    """The thing on whose top another stands."""
+    """The object that supports another."""
     at = extent.mean(axis=0)
     for n, (low, high) in others.items():
         if abs(high[2] - extent[0, 2]) < 0.04 and ((at > low) & (at < high))[:2].all():
@@ -163,7 +163,7 @@ def _shift(
 
 
 def _seen_free(extent: Array, probe: Film) -> bool:
-    """True where a view looks through all that a thing would take."""
+    """Whether a view sees through the whole space that an object would take."""
     corners = np.array([[extent[i, 0], extent[j, 1], extent[m, 2]] for i in (0, 1) for j in (0, 1) for m in (0, 1)])
     corners[:, 2] += 0.03 * (corners[:, 2] == extent[0, 2])
     camera = probe.camera

@@ -1,10 +1,10 @@
-"""One long video whose chunks are worked on side by side: in one process, in two, and on two Ray nodes, where a worker
-and the command itself are ended once. The files must be the same, and as good as the walk's truth says.
+"""One long video with its chunks processed in parallel: in one process, in two, and on two Ray nodes, where a worker
+and the command itself are killed once. The files must be identical, and are scored against the walk's truth.
 
 python benchmarks/cluster.py --frames 280 --json benchmarks/results/cluster.json
 
-Beside the wall time stands the processor time of the command alone, which does what must be done in order: how far more
-machines help is bounded by it. In one process it is all of the work.
+Besides the wall time, the processor time of the command alone is given, which does the sequential part: it bounds the
+speed-up by more machines. In one process it is all of the work.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def _run(walk: Path, memory: Path, name: str) -> dict[str, Any]:
-    """Build a walk in one way; what it took and what came out."""
+    """Build a walk in one way; returns cost and result."""
     memory.unlink(missing_ok=True)
     command = [sys.executable, "-m", "list3r", "build", str(walk), "-m", str(memory), "--poses", "estimate", "--json"]
     with two_ray_nodes() if name.startswith("ray") else contextlib.nullcontext("") as address:
@@ -66,9 +66,9 @@ def _run(walk: Path, memory: Path, name: str) -> dict[str, Any]:
     errors = _answer("eval", "trajectory", str(walk), str(memory))
     found = _answer("eval", "instances", str(walk / "truth.json"), str(memory))
     sha256 = seal(memory, memory.with_suffix(".sealed"), ("benchmark",), "walk")
-    told = {"chunks": report["chunks"], "instances": report["instances"], "ate_m": errors["ate_se3_m"]["rmse"]}
+    figures = {"chunks": report["chunks"], "instances": report["instances"], "ate_m": errors["ate_se3_m"]["rmse"]}
     scores = {k: found["instances_0.25"][k] for k in ("matched", "true_count", "precision", "recall")}
-    return {"wall_s": round(wall_s, 1), "command_cpu_s": round(own_s, 1), "ended": kills, **told, **scores} | {
+    return {"wall_s": round(wall_s, 1), "command_cpu_s": round(own_s, 1), "ended": kills, **figures, **scores} | {
         "sha256": sha256
     }
 

@@ -5,14 +5,13 @@
 
 Each walk (two furnished rooms, 640x480, filmed at 12 frames a second) becomes a folder of its colour pictures, and
 `list3r build FOLDER --reconstruction sfm --intrinsics ...` a memory. `blank` is the share of 7 px windows, at 320 px
-width, whose deviation is below 2.5 grey levels: 0.20 in redkitchen. Things are matched one to one, by masks in every
-tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` says what the things lie on that match
-nothing. `things_scale` is the scale of the world by the middles of the things that are matched at IoU 0.5, over that
-by the cameras: 1 where things lie where the cameras saw them. Relations are those among things matched by masks.
-Walks and reconstructions that are in `--keep` are used again, and then the time is that of what is left.
-With `--rooms` the walks are 300 frames of left-out rooms of `training/worlds`, in which the camera turns where it
-stands; their relations are not known. With `--step METRES` they are those of `wide_walks.py`, which says what is
-measured of them.
+width, with a deviation below 2.5 grey levels: 0.20 in redkitchen. Objects are matched one to one, by masks in every
+tenth frame and by boxes after Sim(3) alignment of the cameras; `false_on_...` classifies objects without a match by the
+surface they are on. `things_scale` is the scale of the world by the centres of objects matched at IoU 0.5, over that by
+the cameras. Relations are those among objects matched by masks. Walks and reconstructions in `--keep` are reused, and
+the time is that of the rest. With `--rooms` the walks are 300 frames of left-out rooms of `training/worlds`, with a
+camera that turns on the spot; their relations are not known. With `--step METRES` they are those of `wide_walks.py`,
+with its figures.
 """
 
 from __future__ import annotations
@@ -44,13 +43,13 @@ from list3r.simulation.dataset import DEPTH_UNITS_PER_M, WalkSettings, write_wal
 
 SIZE = (640, 480)
 EVERY = 10
-"""Frames between those whose masks are compared."""
+"""Frames between two frames with compared masks."""
 STEP = 4
 """Every so many pixels of a mask are compared."""
 ROOM_FRAMES = 300
 """Frames of a walk through a left-out room."""
 LEAST_PX = 150
-"""True things that never cover so many pixels count neither way."""
+"""True objects that never cover so many pixels count neither way."""
 
 Masks = dict[int, dict[int, NDArray[np.bool_]]]
 """By frame and id, thinned by `STEP`."""
@@ -82,7 +81,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--discovery", default="", help="such as learned,sam2; without it the default")
     parser.add_argument("--keep", type=Path, help="folder in which walks, reconstructions and memories are kept")
-    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, beside plain pycolmap")
+    parser.add_argument("--step", type=float, help="walks in steps so wide, metres, compared with plain pycolmap")
     parser.add_argument("--hard", action="store_true", help="... with wider turns, and through door frames")
     parser.add_argument("--frames", type=int, help="of each walk; without it 150 of such walks, else all")
     parser.add_argument("--real", type=Path, help="... and of every eighth frame of this folder with poses")
@@ -205,7 +204,7 @@ def depth_errors(reconstructions: Path, walk: Path) -> dict[str, float]:
 
 
 def scene_errors(memory: Path, walk: Path) -> dict[str, Any]:
-    """Trajectory, things and relations of a memory."""
+    """Trajectory, objects and relations of a memory."""
     true_scene = read_scene(walk / "truth.json")
     exported = memory.with_suffix(".json")
     with open_memory(memory) as opened:
@@ -216,7 +215,7 @@ def scene_errors(memory: Path, walk: Path) -> dict[str, Any]:
     overlaps = compare_masks(true_masks(walk, frames), memory_masks(memory, frames))
     boxes = evaluate_scene(scene, true_scene, S_truth_world)
     by_masks, found = _by_masks(overlaps, scene, true_scene)
-    out = {"ate_sim3_m": round(ate, 4), "things_scale": _things_scale(scene, true_scene, found, S_truth_world)}
+    out = {"ate_sim3_m": round(ate, 4), "things_scale": _objects_scale(scene, true_scene, found, S_truth_world)}
     out |= by_masks
     for name in ("0.25", "0.50"):
         entry = boxes[f"instances_{name}"]
@@ -239,10 +238,10 @@ def _alignment(memory: Path, walk: Path) -> tuple[Sim3, float]:
     return S, float(np.sqrt(np.square(position_errors(true, estimate, S)).mean()))
 
 
-def _things_scale(
+def _objects_scale(
     scene: Mapping[str, Any], truth: Mapping[str, Any], found: list[tuple[int, int, float]], S_truth_world: Sim3
 ) -> float | None:
-    """Scale from the memory's world to the truth's by the middles of things, over that by the cameras."""
+    """Scale from the memory's world to the truth's by the middles of objects, over that by the cameras."""
     boxes, true_boxes = scene_boxes(scene), scene_boxes(truth)
     pairs = [(boxes[e].center, true_boxes[t].center) for t, e, iou in found if iou >= 0.5]
     if len(pairs) < 4:
@@ -252,7 +251,7 @@ def _things_scale(
 
 
 def true_masks(walk: Path, frames: range) -> Masks:
-    """What is truly seen where."""
+    """True objects and their masks."""
     out: Masks = {}
     for frame in frames:
         ids = cv2.imread(str(walk / "ids" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
@@ -263,7 +262,7 @@ def true_masks(walk: Path, frames: range) -> Masks:
 
 
 def memory_masks(memory: Path, frames: range) -> Masks:
-    """What a memory saw where, all chunks together."""
+    """Instances of a memory and their masks, all chunks together."""
     out: Masks = {frame: {} for frame in frames}
     with Store.open(memory) as store:
         present = {i.id for i in store.instances.all()}
@@ -284,12 +283,12 @@ def compare_masks(truth: Masks, found: Masks) -> Overlaps:
     row, column = ({k: n for n, k in enumerate(each)} for each in (true_ids, ids))
     shared = np.zeros((len(true_ids), len(ids)), np.int64)
     true_px, px = np.zeros(len(true_ids), np.int64), np.zeros(len(ids), np.int64)
-    for frame, things in truth.items():
-        for t, mask in things.items():
+    for frame, objects in truth.items():
+        for t, mask in objects.items():
             true_px[row[t]] += mask.sum()
         for e, other in found[frame].items():
             px[column[e]] += other.sum()
-            for t, mask in things.items():
+            for t, mask in objects.items():
                 shared[row[t], column[e]] += (mask & other).sum()
     return Overlaps(true_ids, ids, shared, true_px, px)
 
@@ -297,13 +296,13 @@ def compare_masks(truth: Masks, found: Masks) -> Overlaps:
 def _by_masks(
     overlaps: Overlaps, scene: Mapping[str, Any], truth: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[tuple[int, int, float]]]:
-    """Recall and precision of things by masks, what false ones lie on, relations of the true ones; and the pairs
-    (true id, id, IoU) at IoU 0.25.
+    """Recall and precision of objects by masks, the surfaces under false ones, relations of the true ones; and the
+    pairs (true id, id, IoU) at IoU 0.25.
     """
     wanted = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= LEAST_PX}
-    things = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
+    objects = {e["id"] for e in scene["instances"] if not e["structure"] and e.get("state") != "removed"}
     rows = [n for n, k in enumerate(overlaps.true_ids) if k in wanted]
-    columns = [n for n, k in enumerate(overlaps.ids) if k in things and overlaps.px[n] > 0]
+    columns = [n for n, k in enumerate(overlaps.ids) if k in objects and overlaps.px[n] > 0]
     iou = overlaps.iou()[np.ix_(rows, columns)]
     out: dict[str, Any] = {"things": len(columns), "true_things": len(rows)}
     pairs: list[tuple[int, int]] = []
@@ -312,7 +311,7 @@ def _by_masks(
         out[f"mask_recall_{threshold:.2f}"] = round(len(pairs) / max(len(rows), 1), 3)
         out[f"mask_precision_{threshold:.2f}"] = round(len(pairs) / max(len(columns), 1), 3)
     found = [(overlaps.true_ids[rows[r]], overlaps.ids[columns[c]], float(iou[r, c])) for r, c in pairs]
-    out |= _false_things(overlaps, columns, found, truth)
+    out |= _false_objects(overlaps, columns, found, truth)
     judged = relations_of_matches(scene, truth, found).by_predicate
     for name, entry in judged.items():
         out[f"{name}_recall"], out[f"{name}_precision"] = (
@@ -321,10 +320,10 @@ def _by_masks(
     return out, found
 
 
-def _false_things(
+def _false_objects(
     overlaps: Overlaps, columns: list[int], found: list[tuple[int, int, float]], truth: Mapping[str, Any]
 ) -> dict[str, int]:
-    """How many things that match nothing lie mostly on structure, on a thing that is found, and on one that is not."""
+    """Numbers of unmatched objects mostly on structure, on a found object, and on a missed one."""
     structure = {e["id"] for e in truth["instances"] if e["structure"]}
     matched, known = {e for _, e, _ in found}, {t for t, _, _ in found}
     out = {"false_on_structure": 0, "false_on_found": 0, "false_on_missed": 0}

@@ -1,4 +1,4 @@
-"""How right the confidence of instances is in whole memories, and the weights that make it so.
+"""Calibration of the confidence of instances in whole memories, and fitting of its weights.
 
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --world 9200-9202 --held 5101-5103 --home 61 --colour 46
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --frames 450 --world 9100-9103 --home 51-54 --walks ... --fit
@@ -6,16 +6,15 @@ PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --frames 250 --colour
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --frames 250 --colour 43-48 --every 4 --json FILE2
 PYTHONPATH=. python benchmarks/confidence.py --keep FOLDER --colour 43-48 --room 5121-5129 --measured FILE1 FILE2 --fit
 
-Walks of 150 frames (`--colour`: 100; `--frames`) are built, and their libraries derived anew with nothing left out for
-want of confidence: `--world` rooms of the kind that discovery was trained on, `--held` left-out ones, both with given
-poses, `--home` the simulator's homes with a sensor's depth, `--colour` the same by colour alone, `--room` left-out
-rooms by colour alone (300 frames, `colour.py --rooms`), each `--every` n-th frame of them. `--walks` are folders that
-`discovery_memory.py` kept, `--measured` files that this wrote before. Computed depth has odds of its own: `--fit` is
-for walks with a sensor or for walks without.
+Walks of 150 frames (`--colour`: 100; `--frames`) are built, and their libraries derived again without a threshold of
+confidence: `--world` rooms of the training distribution, `--held` left-out ones, both with given poses, `--home` the
+simulator's homes with a sensor's depth, `--colour` the same by colour alone, `--room` left-out rooms by colour alone
+(300 frames, `colour.py --rooms`), each `--every` n-th frame of them. `--walks` are folders kept by
+`discovery_memory.py`, `--measured` earlier results. Computed depth has weights of its own: `--fit` takes walks either
+with or without a sensor.
 
-An instance is right if it is matched with a true thing by masks at IoU 0.5; those of things hardly in view do not
-count. `--fit` prints `ConfidenceWeights` fitted to all walks, and how right they are in places left out of the fit, one
-in five in turn.
+An instance is right if it is matched with a true object by masks at IoU 0.5; objects hardly in view are ignored.
+`--fit` prints `ConfidenceWeights` fitted to all walks, and their five-fold cross-validation over places.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ def main() -> None:
     parser.add_argument("--measured", type=Path, nargs="*", default=[], help="results that count, too")
     parser.add_argument("--frames", type=int, help="frames of a walk")
     parser.add_argument("--every", type=int, default=1, help="build from every n-th frame of a walk")
-    parser.add_argument("--keep", type=Path, required=True, help="folder of walks and memories; what is there is kept")
+    parser.add_argument("--keep", type=Path, required=True, help="folder of walks and memories; existing ones are kept")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -83,11 +82,11 @@ def main() -> None:
             compared = max(1, EVERY // args.every) * args.every
             found = judged(built(walk, kind, args.every), walk, kind, compared)
             rows.append({"kind": kind, "seed": seed, "place": f"{kind}-{seed}", **found})
-            print(kind, seed, len(found["instances"]), "instances,", found["true"], "things", flush=True)
+            print(kind, seed, len(found["instances"]), "instances,", found["true"], "objects", flush=True)
     for walk in args.walks:
         found = judged(walk / "learned.l3r", walk, "walk", EVERY)
         rows.append({"kind": "walk", "seed": walk.name, "place": "-".join(walk.name.split("-")[:2]), **found})
-        print(walk.name, len(found["instances"]), "instances,", found["true"], "things", flush=True)
+        print(walk.name, len(found["instances"]), "instances,", found["true"], "objects", flush=True)
     if args.fit and len({r["kind"] in COMPUTED for r in rows}) != 1:
         parser.error("--fit wants walks that all have a sensor's depth, or all none")
     table = {k: summary([r for r in rows if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}
@@ -161,7 +160,7 @@ def judged(memory: Path, walk: Path, kind: str, every: int) -> dict[str, Any]:
 
 
 def _with_everything(memory: Path) -> Path:
-    """A copy of a memory whose library leaves nothing out for want of confidence."""
+    """A copy of a memory with a library of any confidence."""
     copy = memory.with_suffix(".everything.l3r")
     shutil.copy(memory, copy)
     with Store.open(copy, writable=True) as store, store.transaction():
@@ -170,7 +169,7 @@ def _with_everything(memory: Path) -> Path:
 
 
 def _signs(memory: Path) -> dict[int, tuple[Signs, float]]:
-    """What tells how sure each instance is that is no structure, and how sure it is."""
+    """Inputs and value of the confidence of each instance that is no structure."""
     with Store.open(memory) as store:
         settings = settings_of(store, ConsolidationSettings())
         world = store.facts[WORLD]
@@ -183,7 +182,7 @@ def _signs(memory: Path) -> dict[int, tuple[Signs, float]]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """How right confidence is, and precision and recall of what is at least so sure."""
+    """Calibration, and precision and recall above each confidence."""
     said = np.array([i["confidence"] for r in rows for i in r["instances"]])
     right = np.array([i["right"] for r in rows for i in r["instances"]], bool)
     true = sum(r["true"] for r in rows)
@@ -196,7 +195,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def fitted(rows: Sequence[dict[str, Any]]) -> ConfidenceWeights:
-    """The weights under which what is right of these walks is likeliest."""
+    """Maximum-likelihood weights of these walks."""
     usual = OF_COMPUTED_DEPTH if rows[0]["kind"] in COMPUTED else ConfidenceWeights()
     signs = [Signs(**i["signs"]) for r in rows for i in r["instances"]]
     y = np.array([i["right"] for r in rows for i in r["instances"]], float)
@@ -215,15 +214,15 @@ def fitted(rows: Sequence[dict[str, Any]]) -> ConfidenceWeights:
 
 
 def left_out(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """How right confidence is of each kind of walk, by weights fitted to four in five of the places, those others."""
+    """Calibration of each kind of walk, by five-fold cross-validation over places."""
     places = sorted({r["place"] for r in rows})
     out: list[dict[str, Any]] = []
     for part in range(FOLDS):
         apart = set(places[part::FOLDS])
         weights = fitted([r for r in rows if r["place"] not in apart])
         for r in (r for r in rows if r["place"] in apart):
-            told = [weights.probability(Signs(**i["signs"])) for i in r["instances"]]
-            said = [i | {"confidence": c} for i, c in zip(r["instances"], told, strict=True)]
+            report = [weights.probability(Signs(**i["signs"])) for i in r["instances"]]
+            said = [i | {"confidence": c} for i, c in zip(r["instances"], report, strict=True)]
             out.append(r | {"instances": said})
     return {k: summary([r for r in out if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in rows)}
 

@@ -1,12 +1,12 @@
-"""Names from a box detector on redkitchen, held against what its pictures show.
+"""Names from a box detector on redkitchen, compared with its pictures.
 
     python benchmarks/detection.py --source PATH --detectors A.param B.param [--reconstruction rgbd sfm]
                                    [--memory FILE ...] [--json FILE]
 
 A memory is built of the whole video (or taken from `--memory`) and named by each detector, from the video and from the
-kept pictures alone. The truth are boxes in single pictures, drawn by hand: a thing is named right when the instance
-whose mask fits its box best bears its name. `others` are things of these names that are none of those, `find` asks for
-"cup on dining table". No wall may be a chair, which holds as long as structure is never named.
+kept pictures alone. The truth is hand-drawn boxes in single pictures: an object is named right when the instance with
+the best fitting mask has its name. `others` are further objects of these names, `find` asks for "cup on dining table".
+No wall may be a chair, as structure is never named.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TRUTH: dict[str, tuple[str, int, tuple[int, int, int, int]]] = {
     "chair in front": ("chair", 1, (320, 380, 588, 456)),
     "purple magazine": ("book", 300, (186, 304, 328, 410)),
 }
-"""What it is called, the number of a picture, and the box of what the depth camera sees of it there, px."""
+"""Its name, the number of a picture, and its box in the depth camera's view there, px."""
 NEAR = 2
 """Frames from that picture within which a mask counts: not every frame of colour video has masks."""
 LEAST_OVERLAP = 0.3
@@ -43,7 +43,7 @@ LEAST_OVERLAP = 0.3
 
 
 def instances_of(store: Store) -> dict[str, int | None]:
-    """The instance that each true thing is, None where the memory holds none."""
+    """The instance that each true object is, None where the memory holds none."""
     home = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
     found: dict[str, int | None] = {}
     for name, (_, frame, box) in TRUTH.items():
@@ -64,18 +64,18 @@ def instances_of(store: Store) -> dict[str, int | None]:
 
 
 def judged(path: Path) -> dict[str, Any]:
-    """What the true things are called, and what else bears their names."""
+    """Names of the true objects, and other instances of these names."""
     with Store.open(path) as store:
         home = instances_of(store)
-        things = {i.id: i for i in store.instances.all(structure=None)}
+        objects = {i.id: i for i in store.instances.all(structure=None)}
         wanted = {name: TRUTH[name][0] for name in TRUTH}
-        said = {name: None if home[name] is None else things[home[name]].label for name in TRUTH}
+        said = {name: None if home[name] is None else objects[home[name]].label for name in TRUTH}
         others: dict[str, int] = {}
-        for i in things.values():
+        for i in objects.values():
             if i.label is not None and i.id not in home.values():
                 others[i.label] = others.get(i.label, 0) + 1
         poses = store.facts.poses
-        structure = sum(i.label is not None for i in things.values() if i.structure is not None)
+        structure = sum(i.label is not None for i in objects.values() if i.structure is not None)
     with list3r.open(path) as memory:
         first = {match.instance.id for match in memory.find("cup on dining table")[:2]}
     mugs = {home["white mug"], home["printed mug"]}
@@ -107,11 +107,11 @@ def main() -> None:
             if k >= len(chosen.memory):
                 run_list3r("build", chosen.source, "-m", str(built), "--reconstruction", kind)
             for detector in chosen.detectors:
-                for looks in ("video", "pictures"):
+                for using in ("video", "pictures"):
                     shutil.copy(built, work)
-                    where = ["--source", chosen.source] if looks == "video" else []
+                    where = ["--source", chosen.source] if using == "video" else []
                     said, _ = run_list3r("detect", str(work), "--detector", str(detector), *where)
-                    row = {"reconstruction": kind, "detector": detector.stem, "looks": looks, "frames": said["frames"]}
+                    row = {"reconstruction": kind, "detector": detector.stem, "looks": using, "frames": said["frames"]}
                     rows.append({**row, **judged(work)})
                     print({k: v for k, v in rows[-1].items() if k != "called"}, flush=True)
     if chosen.json:

@@ -1,4 +1,4 @@
-"""What discovery calls one thing, against the truth of worlds that nothing was tuned on.
+"""Instance discovery, against the truth of left-out worlds.
 
 PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --json benchmarks/results/discovery.json
 PYTHONPATH=. python benchmarks/discovery.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
@@ -7,10 +7,9 @@ PYTHONPATH=. python benchmarks/discovery.py --seeds 6001-6010 --swept
 
 Worlds come from `training/worlds` with families, textures and a sensor that training never shows; the house is one that
 others furnished (MIT-0), given by its folder. Each walk is one chunk with poses that drift by some millimetres; the
-truth is laid on it by all its cameras, as scenes are, not by the first one alone, whose own error moved everything. A
-thing counts from 150 pixels in a view; its true box is that of its visible surface. With `--swept` nothing is left of
-what a sensor read: depth is that of our own plane sweep over the pictures; walks of which it tells too little are left
-out. Estimates of which most pixels show a thing of fewer are neither right nor wrong.
+truth is aligned with it by all its cameras, as scenes are. An object counts from 150 pixels in a view; its true box is
+that of its visible surface. With `--swept` depth comes from our plane sweep over the pictures instead of a sensor;
+walks with too little depth are left out. Estimates mostly on an object of fewer pixels are ignored.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ from training.worlds.catalogue import LABELS
 from training.worlds.film import Film, FilmSettings, frames_of, make_film, reconstruction_of
 
 MIN_PX = 150
-"""Pixels of its largest view from which a true thing counts."""
+"""Pixels of its largest view from which a true object counts."""
 SMALL_M = 0.3
-"""Longest edge up to which a thing is small."""
+"""Longest edge up to which an object is small."""
 
 
 def main() -> None:
@@ -57,13 +56,13 @@ def main() -> None:
     parser.add_argument("--seeds", default="6001-6010", help="such as 6001-6010 or 3,5,8")
     parser.add_argument("--methods", default="learned,true", help="of learned, true")
     parser.add_argument("--sensor", help="structured, tof, lidar or computed; without it each world draws one")
-    parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
+    parser.add_argument("--fitted", action="store_true", help="rooms with built-in parts")
     parser.add_argument("--recessed", action="store_true", help="windows and doors behind the walls; a third built in")
     parser.add_argument("--house", type=Path, help="folder of a Gazebo world, or a labelled scan (PCD); walks there")
     parser.add_argument("--colour", choices=("grey", "none"), help="pictures without hue, or without anything to see")
     parser.add_argument("--swept", action="store_true", help="depth that the plane sweep computes from the pictures")
     parser.add_argument("--weights", type=Path, help="weights of the learned discoverer instead of the shipped ones")
-    parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it beside")
+    parser.add_argument("--also", action="append", default=[], metavar="NAME=FILE", help="other weights of it next to")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows: list[dict[str, Any]] = []
@@ -118,7 +117,7 @@ def film_of(
 
 
 def without_colour(color: NDArray[np.uint8], left: str) -> NDArray[np.uint8]:
-    """Pictures (F, H, W, 3) of which brightness is left ("grey"), or nothing ("none"): one shade."""
+    """Pictures (F, H, W, 3) reduced to brightness ("grey") or to one shade ("none")."""
     if left == "none":
         return np.full_like(color, 150)
     return np.stack([np.repeat(cv2.cvtColor(c, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2) for c in color])
@@ -147,7 +146,7 @@ def make(method: str, settings: InstanceSettings, film: Film, weights: Path | No
 
 
 class TrueDiscoverer:
-    """Proposes the true masks: the ceiling of what discovery can tell from these views."""
+    """Proposes the true masks: the upper bound of discovery in these views."""
 
     feature_space = "true@1/1"
 
@@ -173,7 +172,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
     T_chunk_world = _laid_by_cameras(film, views)
     frame = _upright(T_chunk_world.rotation @ np.array([0.0, 0.0, 1.0]))
     stride, structural = views.stride, {t.id for t in film.things if t.structure}
-    true, told, pairs = _Gathered(), _Gathered(), []
+    true, report, pairs = _Gathered(), _Gathered(), []
     said: dict[int, tuple[float, str, float]] = {}
     right = claimed = there = 0
     for proposals in found:
@@ -196,13 +195,13 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
             mine,
             views.small_depth(proposals.position) > 0,
         )
-        told.add(points, _without_skirts(theirs, views, view), view.confirmed)
+        report.add(points, _without_skirts(theirs, views, view), view.confirmed)
         pairs.append(np.stack([mine[view.confirmed], theirs[view.confirmed]], axis=1))
     pixels, large = np.concatenate(pairs), true.large(MIN_PX)
     wanted = list(true.boxes(MIN_PX).values())
     faint = [box for value, box in true.boxes().items() if value not in large]
     of_faint = _of_faint(pixels, large)
-    boxes = [box for value, box in told.boxes_of_supports().items() if value not in of_faint]
+    boxes = [box for value, box in report.boxes_of_supports().items() if value not in of_faint]
     out: dict[str, Any] = {"true": len(wanted), "structure": [int(right), int(claimed), int(there)]}
     for threshold in (0.25, 0.5):
         kept = _without_faint(wanted, faint, boxes, threshold)
@@ -218,7 +217,7 @@ def figures(film: Film, views: ChunkViews, found: Sequence[Proposals]) -> dict[s
 
 
 def _without_skirts(labels: NDArray[np.int64], views: ChunkViews, view: View) -> NDArray[np.int64]:
-    """Things of a view's pixels, -1 for none, less what memories leave out of surfaces, see `collect_supports`."""
+    """Objects of a view's pixels, -1 for none, without pixels that memories leave out, see `collect_supports`."""
     if views.reconstruction.depth_noise is None:
         return labels
     image = (labels + 1).astype(np.int32)
@@ -226,7 +225,7 @@ def _without_skirts(labels: NDArray[np.int64], views: ChunkViews, view: View) ->
 
 
 def _laid_by_cameras(film: Film, views: ChunkViews) -> Sim3:
-    """What moves the truth onto the chunk."""
+    """The alignment of the truth with the chunk."""
     truth, chunk = (Trajectory(film.time_s, T) for T in (film.T_world_cam, views.reconstruction.T_chunk_cam))
     return alignment_of(chunk, truth, with_scale=False)
 
@@ -240,7 +239,7 @@ def _true_points(film: Film, views: ChunkViews, position: int, T_chunk_world: Si
 
 
 def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
-    """Things found and listed by IoU of their pixels over all views, of those that are `large` enough to count."""
+    """Objects found and listed by IoU of their pixels over all views, of those that are `large` enough to count."""
     true, _, iou = _mask_ious(pairs)
     wanted = np.array([t in large for t in true.tolist()], bool)
     out = {}
@@ -253,17 +252,17 @@ def _by_masks(pairs: NDArray[np.int64], large: set[int]) -> dict[str, int]:
 
 
 def _mask_ious(pairs: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """True things (T,), found ones (E,), and the IoU of their pixels over all views (T, E)."""
+    """True objects (T,), found ones (E,), and the IoU of their pixels over all views (T, E)."""
     true, at = np.unique(pairs[:, 0], return_inverse=True)
-    told, to = np.unique(pairs[:, 1], return_inverse=True)
-    shared = np.zeros((len(true), len(told)))
+    report, to = np.unique(pairs[:, 1], return_inverse=True)
+    shared = np.zeros((len(true), len(report)))
     np.add.at(shared, (at, to), 1)
     union = shared.sum(axis=1, keepdims=True) + shared.sum(axis=0, keepdims=True) - shared
-    return true[true >= 0], told[told >= 0], (shared / union)[true >= 0][:, told >= 0]
+    return true[true >= 0], report[report >= 0], (shared / union)[true >= 0][:, report >= 0]
 
 
 class _Gathered:
-    """Points of things over the views."""
+    """Points of objects over the views."""
 
     def __init__(self) -> None:
         self._points: dict[int, list[NDArray[np.float32]]] = {}
@@ -279,11 +278,11 @@ class _Gathered:
             self._points.setdefault(value, []).append(points.reshape(-1, 3)[sure])
 
     def large(self, least_px: int) -> set[int]:
-        """What covers so many pixels of a view and has a box."""
+        """Objects with so many pixels in a view and a box."""
         return {value for value in self._joined() if self._most[value] >= least_px}
 
     def boxes(self, least_px: int = 0) -> dict[int, OrientedBox]:
-        """Boxes of what covers so many pixels of a view, as of true surfaces."""
+        """Boxes of objects with so many pixels in a view, of their true surfaces."""
         return {
             value: _wide(upright_box(points[:: max(1, len(points) // 4000)], trim=0.005))
             for value, points in self._joined().items()
@@ -308,7 +307,7 @@ class _Gathered:
 def gathered_boxes(
     points: Sequence[NDArray[np.float32]], labels: Sequence[NDArray[np.int64]]
 ) -> dict[int, OrientedBox]:
-    """Boxes of true surfaces from points (h, w, 3) and the thing of each, -1 for none, of several views."""
+    """Boxes of true surfaces from points (h, w, 3) and the object of each, -1 for none, of several views."""
     every = _Gathered()
     for p, own in zip(points, labels, strict=True):
         every.add(p, own, np.ones(own.shape, bool))
@@ -321,7 +320,7 @@ def _wide(box: OrientedBox) -> OrientedBox:
 
 
 def _said(proposals: Proposals) -> dict[int, tuple[float, str, float]]:
-    """Confidence, likeliest name and its probability of each thing, where the discoverer tells them."""
+    """Confidence, likeliest name and its probability of each object, where the discoverer has them."""
     if proposals.named is None or proposals.identity is None:
         return {}
     rows = zip(proposals.identity.tolist(), proposals.score.tolist(), proposals.named, strict=True)
@@ -331,36 +330,36 @@ def _said(proposals: Proposals) -> dict[int, tuple[float, str, float]]:
 def _as_sure_as_right(
     pairs: NDArray[np.int64], large: set[int], said: dict[int, tuple[float, str, float]], labels: dict[int, str]
 ) -> dict[str, Any]:
-    """Of each thing that is named: [confidence, whether it is one thing by masks at IoU 0.5], and of those that match a
-    true thing at 0.25: [probability of its name, whether it is right]; the house's makers call things otherwise.
+    """Of each object that is named: [confidence, whether it is one object by masks at IoU 0.5], and of those that match
+    a true object at 0.25: [probability of its name, whether it is right]; the house's makers use other names.
     """
     best: dict[int, tuple[float, int]] = {}
-    true, told, iou = _mask_ious(pairs)
-    for column, number in enumerate(told.tolist()):
+    true, report, iou = _mask_ious(pairs)
+    for column, number in enumerate(report.tolist()):
         row = int(iou[:, column].argmax()) if len(true) else 0
         best[number] = (float(iou[row, column]), int(true[row])) if len(true) else (0.0, -1)
     whole, names = [], []
     for number, (score, name, probability) in sorted(said.items()):
-        share, thing = best.get(number, (0.0, -1))
-        if share >= 0.25 and thing not in large:
+        share, obj = best.get(number, (0.0, -1))
+        if share >= 0.25 and obj not in large:
             continue
         whole.append([score, int(share >= 0.5)])
-        if share >= 0.25 and labels[thing + 1] in LABELS:
-            names.append([probability, int(labels[thing + 1] == name)])
+        if share >= 0.25 and labels[obj + 1] in LABELS:
+            names.append([probability, int(labels[obj + 1] == name)])
     return {"whole": whole, "names": names}
 
 
 def _of_faint(pairs: NDArray[np.int64], large: set[int]) -> set[int]:
-    """Estimates of which most pixels show one thing that was hardly in view: neither right nor wrong."""
+    """Ignored estimates: mostly on one object that was hardly in view."""
     codes, count = np.unique(pairs[pairs[:, 1] >= 0], axis=0, return_counts=True)
-    best = {int(told): int(true) for true, told in codes[np.argsort(count, kind="stable")].tolist()}
-    return {told for told, true in best.items() if true >= 0 and true not in large}
+    best = {int(report): int(true) for true, report in codes[np.argsort(count, kind="stable")].tolist()}
+    return {report for report, true in best.items() if true >= 0 and true not in large}
 
 
 def _without_faint(
     wanted: list[OrientedBox], faint: list[OrientedBox], boxes: list[OrientedBox], threshold: float
 ) -> list[OrientedBox]:
-    """Estimates without those that match a true thing which was hardly in view."""
+    """Estimates without matches of true objects that were hardly in view."""
     matches = evaluate_instances([*wanted, *faint], boxes, threshold).matches
     ignored = {e for t, e, _ in matches if t >= len(wanted)}
     return [b for k, b in enumerate(boxes) if k not in ignored]
@@ -373,7 +372,7 @@ def _upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Figures over all walks, each thing counting the same."""
+    """Figures over all walks, each object counting the same."""
     total: Callable[[str], int] = lambda key: sum(int(r[key]) for r in rows)  # noqa: E731
     out: dict[str, Any] = {"walks": len(rows), "things": total("true")}
     for tag in ("0.25", "0.5"):

@@ -1,13 +1,13 @@
-"""Where the learned discoverer loses against true masks: one rung of an oracle ladder for each of its steps.
+"""Losses of the learned discoverer against true masks: an oracle ladder with a rung for each step.
 
 PYTHONPATH=. python benchmarks/discovery_ladder.py --seeds 5001,5004,5008 --json FILE
 
 Each rung takes one more step from the discoverer and the rest from the truth; figures are those of `discovery.py`:
-`true` true masks, `voxels` the true thing of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true thing
-of most of their voxels, `joined` likewise of what parts make up step by step, `tree` of the clusters that agglomeration
-then passes through those that fit true things best, `cut` the clusters where it stops, those that fit a true thing,
-`bound` likewise without those that the networks take for structure, `unlisted` all of these, `listed` those that are
-sure enough: what the discoverer proposes. What tracking and merging make of it is measured by `discovery_memory.py`.
+`true` true masks, `voxels` the true object of most pixels of each voxel, `superpoints`, `pieces`, `parts` the true
+object of most of their voxels, `joined` likewise of the joined parts, `tree` the best fitting clusters of the
+agglomeration's dendrogram, `cut` the clusters where it stops that fit a true object, `bound` likewise without those
+classified as structure, `unlisted` all of these, `listed` those above the confidence threshold: the discoverer's
+proposals. Tracking and merging are measured by `discovery_memory.py`.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_sur
 from list3r.instances.learned.network import classify
 from list3r.instances.learned.pieces import cut_pieces
 from list3r.instances.learned.superpoints import cut_superpoints
-from list3r.instances.learned.things import classify_things
+from list3r.instances.learned.verdicts import classify_segments
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.library import select_prompts
 from training.samples import chunk_settings, voxel_truth
 from training.worlds.film import Film, frames_of, reconstruction_of
 
 ENDS = np.arange(-4.0, 5.01, 0.5)
-"""Log odds at which the tree of agglomeration is looked at."""
+"""Log odds at which the dendrogram is sampled."""
 FITS = 0.25
-"""IoU by voxels from which a cluster fits a true thing."""
+"""IoU by voxels from which a cluster fits a true object."""
 
 SHOWN = (
     *(f"{kind}{what}_{iou}" for kind in ("", "mask_") for iou in ("0.25", "0.5") for what in ("recall", "precision")),
@@ -84,9 +84,9 @@ class Chunk:
     views: ChunkViews
     surface: ChunkSurface
     truth: NDArray[np.int32]
-    """True thing of each voxel, 0 for none. Shape (N,)."""
+    """True object of each voxel, 0 for none. Shape (N,)."""
     bound: frozenset[int]
-    """True things that are structure."""
+    """True objects that are structure."""
 
     @property
     def cloud(self) -> Cloud:
@@ -110,20 +110,20 @@ def climb(film: Film, every: int, seed: int, weights: Path | None) -> dict[str, 
     discoverer = LearnedDiscoverer(settings, weights)
     out: dict[str, dict[str, Any]] = {}
 
-    def told(cut: Callable[[int], Proposals]) -> dict[str, Any]:
+    def scores(cut: Callable[[int], Proposals]) -> dict[str, Any]:
         return figures(film, views, [select_prompts(cut(p), settings) for p in views.anchors])
 
     true = TrueDiscoverer(film)
-    out["true"] = told(lambda p: true(frames, reconstruction, p))
+    out["true"] = scores(lambda p: true(frames, reconstruction, p))
     for name, (labels, flat) in rungs(chunk, weights).items():
-        out[name] = told(lambda p, labels=labels, flat=flat: proposed(discoverer, chunk, labels, flat, p))
-    out["listed"] = told(lambda p: discoverer(frames, reconstruction, p))
+        out[name] = scores(lambda p, labels=labels, flat=flat: proposed(discoverer, chunk, labels, flat, p))
+    out["listed"] = scores(lambda p: discoverer(frames, reconstruction, p))
     forget_views()
     return out
 
 
 def proposed(discoverer: LearnedDiscoverer, chunk: Chunk, labels: Labels, flat: NDArray[np.bool_], p: int) -> Proposals:
-    """Clusters as masks on an anchor; `flat` are those that are structure."""
+    """Clusters as masks on an anchor; `flat` are structure."""
     segments = tuple(Segment(None, bool(f), 1.0) for f in flat)
     cut = Segmentation(np.asarray(labels + 1, np.int32), segments, chunk.surface.around.up)
     image = discoverer._label_view(chunk.views, p, chunk.cloud, cut)
@@ -143,15 +143,15 @@ def rungs(chunk: Chunk, file: Path | None) -> dict[str, tuple[Labels, NDArray[np
     g = pieces.graph
     first = agglomerate(len(g.nodes), g.left, g.right, classify(weights, "fine", g).affinity, g.weight, s.sure)
     out["parts"] = named(chunk, majority(chunk, pieces.joined(first)))
-    parts, coarse, told = join_parts(surface, pieces, weights, s)
+    parts, coarse, scores = join_parts(surface, pieces, weights, s)
     out["joined"] = named(chunk, majority(chunk, parts))
-    at = lambda end: agglomerate(len(coarse.nodes), coarse.left, coarse.right, told.affinity, coarse.weight, end)  # noqa: E731
+    at = lambda end: agglomerate(len(coarse.nodes), coarse.left, coarse.right, scores.affinity, coarse.weight, end)  # noqa: E731
     out["tree"] = best_of(chunk, [parts, *(np.append(at(e), -1)[parts] for e in ENDS)])
     own = at(s.enough)
     labels = np.asarray(np.append(own, -1)[parts], np.int32)
     labels = spread_labels(surface.cloud.points, labels, s.hop_m * surface.around.unit)
     out["cut"] = best_of(chunk, [labels])
-    verdicts = classify_things(weights, own, coarse, told)
+    verdicts = classify_segments(weights, own, coarse, scores)
     free = verdicts.structure <= 0.5
     out["bound"] = best_of(chunk, [np.where(np.append(free, False)[labels], labels, -1)])
     out["unlisted"] = labels, ~free
@@ -166,36 +166,36 @@ def named(chunk: Chunk, ids: NDArray[np.int32]) -> tuple[Labels, NDArray[np.bool
 
 
 def majority(chunk: Chunk, labels: Labels) -> NDArray[np.int32]:
-    """The true thing of most voxels of each voxel's cluster, -1 where most are of none. Shape (N,)."""
+    """The true object of most voxels of each voxel's cluster, -1 where most are of none. Shape (N,)."""
     known = labels >= 0
     codes, votes = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
     order = np.lexsort((votes, codes >> 16))
-    thing = np.full(int(labels.max(initial=-1)) + 2, -1, np.int32)
-    thing[codes[order] >> 16] = codes[order] & 0xFFFF
-    thing[thing == 0] = -1
-    thing[-1] = -1
-    return thing[labels]
+    obj = np.full(int(labels.max(initial=-1)) + 2, -1, np.int32)
+    obj[codes[order] >> 16] = codes[order] & 0xFFFF
+    obj[obj == 0] = -1
+    obj[-1] = -1
+    return obj[labels]
 
 
 def best_of(chunk: Chunk, groupings: list[NDArray[np.int32]]) -> tuple[Labels, NDArray[np.bool_]]:
-    """The clusters of nested groupings that fit true things best, none in another, best first."""
+    """The clusters of nested groupings that fit true objects best, none in another, best first."""
     size = np.bincount(chunk.truth)
     found: list[tuple[float, int, int, int]] = []
     for level, labels in enumerate(groupings):
         known = labels >= 0
         count = np.bincount(labels[known])
         codes, shared = np.unique(labels[known].astype(np.int64) << 16 | chunk.truth[known], return_counts=True)
-        cluster, thing = codes >> 16, codes & 0xFFFF
-        iou = shared / (count[cluster] + size[thing] - shared)
-        rows = (thing > 0) & (iou >= FITS)
-        fits = (iou[rows].tolist(), cluster[rows].tolist(), thing[rows].tolist())
+        cluster, obj = codes >> 16, codes & 0xFFFF
+        iou = shared / (count[cluster] + size[obj] - shared)
+        rows = (obj > 0) & (iou >= FITS)
+        fits = (iou[rows].tolist(), cluster[rows].tolist(), obj[rows].tolist())
         found += [(share, level, k, t) for share, k, t in zip(*fits, strict=True)]
     ids, done = np.full(len(chunk.truth), -1, np.int32), set()
-    for _, level, cluster, thing in sorted(found, key=lambda e: (-e[0], e[1], e[2])):
+    for _, level, cluster, obj in sorted(found, key=lambda e: (-e[0], e[1], e[2])):
         mine = groupings[level] == cluster
-        if thing not in done and (ids[mine] < 0).all():
-            ids[mine] = thing
-            done.add(thing)
+        if obj not in done and (ids[mine] < 0).all():
+            ids[mine] = obj
+            done.add(obj)
     return named(chunk, ids)
 
 

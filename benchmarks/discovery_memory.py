@@ -1,15 +1,14 @@
-"""Whole memories of walks that nothing was tuned on: things after tracking and merging over chunks.
+"""Whole memories of left-out walks: objects after tracking and merging over chunks.
 
 PYTHONPATH=. python benchmarks/discovery_memory.py --seeds 5101-5103 --keep FOLDER --json FILE
 PYTHONPATH=. python benchmarks/discovery_memory.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-3
 PYTHONPATH=. python benchmarks/discovery_memory.py --seeds 5121-5126 --frames 450
 
 The worlds and the house are those of `discovery.py`, every frame filmed, so that a walk of 150 frames is two chunks and
-one of 450 six; poses are given, off by a drift of some millimetres; memory and truth are laid on one another by all
-cameras. A thing counts from 150 pixels with depth in a view, and its true box is that of its surface that has depth in
-some view: what lies beyond the reach of the sensor cannot be laid anywhere. `split` and `joined` are told by masks:
-pairs of listed instances of which most pixels lie on one true thing, and pairs of true things that one instance holds
-half of each, both for each true thing.
+one of 450 six; poses are given, with a drift of some millimetres; memory and truth are aligned by all cameras. An
+object counts from 150 pixels with depth in a view, and its true box is that of its surface with depth in some view.
+`split` and `joined` are measured by masks: pairs of listed instances mostly on one true object, and pairs of true
+objects with half of each in one instance, both per true object.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from list3r.simulation.dataset import DEPTH_UNITS_PER_M, frame_name
 from training.worlds.film import Film, FilmSettings, make_film, reconstruction_of
 
 EVERY = 5
-"""Frames between those whose masks are compared."""
+"""Frames between two frames with compared masks."""
 SENSORS = ("structured", "lidar", "tof")
 
 
@@ -47,7 +46,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="5101-5103")
     parser.add_argument("--methods", default="learned")
     parser.add_argument("--house", type=Path)
-    parser.add_argument("--fitted", action="store_true", help="rooms with what is built in")
+    parser.add_argument("--fitted", action="store_true", help="rooms with built-in parts")
     parser.add_argument("--frames", type=int, default=150, help="of each walk")
     parser.add_argument("--keep", type=Path, help="folder in which walks are kept")
     parser.add_argument("--json", type=Path)
@@ -98,11 +97,11 @@ def write_film(root: Path, film: Film, seed: int) -> None:
     write_tum(root / "cameras.txt", Trajectory(film.time_s, film.T_world_cam))
     boxes, largest = true_boxes(film)
     entries = []
-    for thing in film.things:
-        entry: dict[str, Any] = {"id": thing.id, "label": thing.label, "structure": thing.structure}
-        entry["largest_px"] = largest.get(thing.id, 0)
-        if thing.id in boxes:
-            box = boxes[thing.id]
+    for obj in film.things:
+        entry: dict[str, Any] = {"id": obj.id, "label": obj.label, "structure": obj.structure}
+        entry["largest_px"] = largest.get(obj.id, 0)
+        if obj.id in boxes:
+            box = boxes[obj.id]
             turn = quat_wxyz_from_rotation(box.rotation).tolist()
             entry["box"] = {"center": box.center.tolist(), "size": box.size.tolist(), "quat_wxyz": turn}
             entries.append(entry)
@@ -110,7 +109,7 @@ def write_film(root: Path, film: Film, seed: int) -> None:
 
 
 def true_boxes(film: Film) -> tuple[dict[int, Any], dict[int, int]]:
-    """The boxes by id of the surfaces of things that have depth, and the pixels with depth of their largest views."""
+    """The boxes by id of the surfaces of objects that have depth, and the pixels with depth of their largest views."""
     from list3r.reconstruction.base import backproject
 
     points: list[NDArray[np.float32]] = []
@@ -122,8 +121,8 @@ def true_boxes(film: Film) -> tuple[dict[int, Any], dict[int, int]]:
         seen = np.where(film.depth[k] > 0, film.ids[k], 0).astype(np.int64)
         ids.append(seen[::2, ::2] - 1)
         area = np.bincount(seen.ravel())
-        for thing in np.flatnonzero(area).tolist():
-            largest[thing] = max(largest.get(thing, 0), int(area[thing]))
+        for obj in np.flatnonzero(area).tolist():
+            largest[obj] = max(largest.get(obj, 0), int(area[obj]))
     return {k + 1: box for k, box in gathered_boxes(points, ids).items()}, largest
 
 
@@ -153,7 +152,7 @@ def measured(walk: Path, method: str) -> dict[str, Any]:
 
 
 def by_masks(overlaps: Overlaps, scene: dict[str, Any], truth: dict[str, Any]) -> dict[str, int]:
-    """Things found by masks, and what is split and joined."""
+    """Objects found by masks, and splits and joins."""
     free = {e["id"] for e in truth["instances"] if not e["structure"]}
     large = {e["id"] for e in truth["instances"] if not e["structure"] and e["largest_px"] >= MIN_PX}
     listed = {e["id"] for e in scene["instances"] if not e["structure"]}
@@ -176,16 +175,16 @@ def by_masks(overlaps: Overlaps, scene: dict[str, Any], truth: dict[str, Any]) -
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Figures over all walks, each thing counting the same."""
+    """Figures over all walks, each object counting the same."""
     total = lambda key: sum(int(r[key]) for r in rows)  # noqa: E731
-    things = max(total("true"), 1)
+    objects = max(total("true"), 1)
     out: dict[str, Any] = {"walks": len(rows), "things": total("true")}
     for tag in ("0.25", "0.5"):
         for kind in ("", "mask_"):
-            out[f"{kind}recall_{tag}"] = round(total(f"{kind}found_{tag}") / things, 3)
+            out[f"{kind}recall_{tag}"] = round(total(f"{kind}found_{tag}") / objects, 3)
             out[f"{kind}precision_{tag}"] = round(total(f"{kind}found_{tag}") / max(total(f"{kind}listed_{tag}"), 1), 3)
     for key in ("duplicates", "merged", "split", "joined", "on_structure"):
-        out[f"{key}_per_thing"] = round(total(key) / things, 3)
+        out[f"{key}_per_thing"] = round(total(key) / objects, 3)
     return out
 
 

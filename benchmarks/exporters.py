@@ -1,10 +1,10 @@
-"""What every export takes as a memory grows: processor seconds, peak memory, bytes.
+"""Cost of every export as a memory grows: processor seconds, peak memory, bytes.
 
 python benchmarks/exporters.py --instances 0,1,1000,100000 --json benchmarks/results/exporters.json
 
-The memories are made up: things of 60 points with labels in several scripts, six to a table, in rooms side by side, all
-written through the store's verbs; every chunk keeps ten pictures, the first of which shows its things. Each export is
-the program in a process of its own. `plan.svg` among the formats is the plan as SVG.
+The memories are synthetic: objects of 60 points with labels in several scripts, six to a table, in rooms side by side,
+all written through the store's verbs; every chunk keeps ten pictures, the first of which shows its objects. Each export
+runs in its own process. `plan.svg` among the formats is the plan as SVG.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ def main() -> None:
 
 
 def is_here(name: str) -> bool:
-    """Tell whether the package that a format takes is installed."""
+    """Return whether the package that a format takes is installed."""
     package = FORMATS[name.split(".")[0]].package
     return not package or importlib.util.find_spec(package) is not None
 
 
 def measure(memory: Path, name: str, folder: Path, limit: float) -> dict[str, Any]:
-    """Export in a process of its own; its processor seconds, peak memory and what it wrote."""
+    """Export in a process of its own; returns its processor seconds, peak memory and files."""
     folder.mkdir()
     to, _, ending = name.partition(".")
     suffix = f".{ending}" if ending else (*FORMATS[to].suffixes, "")[0]
@@ -121,7 +121,7 @@ def _limit(seconds: float) -> Any:
 
 
 def write_memory(path: Path, count: int) -> None:
-    """Write a finished memory of so many things."""
+    """Write a finished memory of so many objects."""
     rng = np.random.default_rng(count)
     with Store.create(path) as store, store.transaction():
         session = store.sessions.add("made", "made", {}, 10 * (count // IN_CHUNK + 1))
@@ -129,8 +129,8 @@ def write_memory(path: Path, count: int) -> None:
         chunks = []
         for index, first in enumerate(range(0, max(count, 1), IN_CHUNK)):
             ids = range(first + 1, min(count, first + IN_CHUNK) + 1)
-            instances = [thing(n, rng) for n in ids]
-            local = tuple(local_thing(k, i, 10 * index, rng) for k, i in enumerate(instances))
+            instances = [make_object(n, rng) for n in ids]
+            local = tuple(local_instance(k, i, 10 * index, rng) for k, i in enumerate(instances))
             chunk = store.chunks.add(session, chunk_of(index, local))
             chunks.append(chunk)
             store.instances.put(instances)
@@ -143,8 +143,8 @@ def write_memory(path: Path, count: int) -> None:
         store.sessions.complete(session)
 
 
-def thing(n: int, rng: np.random.Generator) -> Instance:
-    """A table, or a thing on the table before it."""
+def make_object(n: int, rng: np.random.Generator) -> Instance:
+    """A table, or an object on the table before it."""
     place, k = divmod(n - 1, 7)
     room = np.array([2.0 * (place % 200), 2.0 * (place // 200), 0.0])
     size = np.array([1.2, 0.8, 0.7]) if k == 0 else rng.uniform(0.05, 0.3, 3)
@@ -170,8 +170,8 @@ def thing(n: int, rng: np.random.Generator) -> Instance:
     )
 
 
-def local_thing(k: int, i: Instance, frame: int, rng: np.random.Generator) -> LocalInstance:
-    """What a chunk saw of it: points on its box, a mask in one frame."""
+def local_instance(k: int, i: Instance, frame: int, rng: np.random.Generator) -> LocalInstance:
+    """Its local instance in a chunk: points on its box, a mask in one frame."""
     unit = rng.uniform(-0.5, 0.5, (POINTS, 3))
     axis = rng.integers(0, 3, POINTS)
     unit[np.arange(POINTS), axis] = np.sign(unit[np.arange(POINTS), axis]) * 0.5

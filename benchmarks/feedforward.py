@@ -132,7 +132,7 @@ def _error_at(S: Sim3, place: Array) -> tuple[float, float, float]:
 
 
 def _depth_errors(video: SimulatedVideo, chunk: ChunkResult, model: FeedForwardModel) -> dict[str, float]:
-    """Error of depth in camera coordinates after each frame's own scale, and what confidence knows of it."""
+    """Error of depth in camera coordinates after each frame's own scale, and its correlation with confidence."""
     s = chunk.samples
     row = np.searchsorted(s.camera_frames, s.frame)
     T = s.T_chunk_cam[row]

@@ -1,14 +1,14 @@
-"""How well frame descriptors find a place again: simulated ones by kind of video, and real ones on a real sequence.
+"""Place recognition by frame descriptors: simulated ones by kind of video, and real ones on a real sequence.
 
     python benchmarks/frame_likeness.py --json FILE                                   # every kind of video, one seed
     python benchmarks/frame_likeness.py --real .../redkitchen --aliked .../aliked-t16.pth --json FILE
 
-Pairs of frames more than 100 apart; a pair is a revisit where both see 30 % of the other's surface, and none where
-they share under 5 %. Told are the share of the revisits that a threshold of precision 0.9 and 0.99 finds, and how many
-frames with a revisit have one that shares 10 % as the frame most like them (recall@1). Real: VLAD of SIFT as builds
-have it, and of ALIKED with words of the first 30 frames. Of the simulated masks of the first chunk are told, by pixels
-over all frames: recall and precision at IoU 0.5, tracks that hold a second thing, further tracks of one thing, and
-tracks of walls and floors, as shares of the things or of the tracks.
+Pairs of frames more than 100 apart; a pair is a revisit where both see 30 % of the other's surface, and none where they
+share under 5 %. Figures are the recall of revisits at the thresholds of precision 0.9 and 0.99, and the share of frames
+with a revisit whose most similar frame shares 10 % (recall@1). Real: VLAD of SIFT as builds have it, and of ALIKED with
+words of the first 30 frames. Simulated masks of the first chunk are scored by pixels over all frames: recall and
+precision at IoU 0.5, tracks that hold a second object, further tracks of one object, and tracks of walls and floors, as
+shares of the objects or of the tracks.
 """
 
 from __future__ import annotations
@@ -25,17 +25,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 OLD, RETURNS = "calm,loop,kidnap,dynamic,twins,sparse,corridor", "opposite,night,moved,alike,halls,seasons"
 APART, REVISIT, NONE, FOUND = 100, 0.30, 0.05, 0.10
-"""Frames between the two of a pair; shares of surface of a revisit, of none, and of what counts as found."""
+"""Frames between the two of a pair; shares of surface of a revisit, of none, and of a correct match."""
 LEAST_PX = 300
-"""Pixels of a thing over a chunk of a hundred frames from which it counts."""
+"""Pixels of an object over a chunk of a hundred frames from which it counts."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", default=f"{OLD},{RETURNS}")
-    parser.add_argument(
-        "--seeds", default="51,101", help="of the older kinds, and of those in which a place looks otherwise"
-    )
+    parser.add_argument("--seeds", default="51,101", help="of the older kinds, and of those with a changed appearance")
     parser.add_argument("--real", type=Path, help="a folder as redkitchen's: colour, depth and poses of a frame each")
     parser.add_argument("--aliked", type=Path, help="weights of ALIKED")
     parser.add_argument("--json", type=Path)
@@ -45,8 +43,8 @@ def main() -> None:
     else:
         old, returns = map(int, words.seeds.split(","))
         result = {p: simulated(p, returns if p in RETURNS.split(",") else old) for p in words.presets.split(",")}
-    for name, told in result.items():
-        print(name, told)
+    for name, report in result.items():
+        print(name, report)
     write_json(words.json, {"likeness": result})
 
 
@@ -62,21 +60,21 @@ def simulated(preset: str, seed: int) -> dict[str, Any]:
     errors = FeedForwardSettings.unseen_home(preset == "halls") if later else FeedForwardSettings()
     rows = np.arange(0, len(video.time_s), 5)
     model = FeedForwardModel(video, errors, seed=seed)
-    told = figures(rows, seen_share(video, rows, rows, MOST_DEG), model.descriptors[rows].astype(np.float64))
-    return told | {"seed": seed, "masks": masks(video, model)}
+    report = figures(rows, seen_share(video, rows, rows, MOST_DEG), model.descriptors[rows].astype(np.float64))
+    return report | {"seed": seed, "masks": masks(video, model)}
 
 
 def masks(video: Any, model: Any) -> dict[str, Any]:
-    """What is right of the simulated masks of the first chunk, by pixels of all its frames."""
+    """Scores of the simulated masks of the first chunk, by pixels of all its frames."""
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
     from list3r.memory.masks import decode_mask
 
     span = plan_chunks(len(video.time_s), ChunkSettings(), ())[0]
     library = model.chunk(span).library
-    things = {t.id for t in video.world.things if t.structure is None}
+    objects = {t.id for t in video.world.objects if t.structure is None}
     ids = video.ids[span.start : span.stop]
     size = np.bincount(ids.ravel())
-    known = [k for k in sorted(things) if k < len(size) and size[k] >= LEAST_PX]
+    known = [k for k in sorted(objects) if k < len(size) and size[k] >= LEAST_PX]
     tracks = [i.track for i in library.instances if not i.structure and not i.dynamic]
     held = np.zeros((len(tracks), len(size)))
     for row, track in zip(held, tracks, strict=True):
@@ -84,8 +82,8 @@ def masks(video: Any, model: Any) -> dict[str, Any]:
             row += np.bincount(ids[frame - span.start][decode_mask(runs, track.image_size)], minlength=len(size))
     iou = held / (held.sum(axis=1, keepdims=True) + size - held)
     most = held.argmax(axis=1)
-    own = np.isin(most, sorted(things))
-    second = np.sort(np.where(np.isin(np.arange(len(size)), sorted(things)), held, 0.0), axis=1)[:, -2]
+    own = np.isin(most, sorted(objects))
+    second = np.sort(np.where(np.isin(np.arange(len(size)), sorted(objects)), held, 0.0), axis=1)[:, -2]
     merged = own & (second >= 0.25 * held.sum(axis=1))
     further = own.sum() - len(np.unique(most[own]))
     return {

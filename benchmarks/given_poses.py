@@ -1,28 +1,27 @@
 """A phone's walk through a simulated home, built with its poses as given, as a prior, without them, and with the true
-ones (which is the most that poses can give).
+ones (the upper bound).
 
 python benchmarks/given_poses.py --seeds 1,2,3,4,5 --json benchmarks/results/given_poses.json
 python benchmarks/given_poses.py --blind --modes given,prior,estimate --json benchmarks/results/given_poses_blind.json
 python benchmarks/given_poses.py --rooms --frames 300 --seeds 72,73,74,75,76 --modes given,prior,estimate --keep F
 
 The recording is like Record3D's: depth of 256 x 192 with a LiDAR's noise and confidence, ARKit's poses with a drift of
-1 % and a jump (`simulation/phone.py`). ATE after a rigid alignment; tilt is the angle between the memory's vertical
-and the true one; instances by boxes of the truth at an overlap of 0.25 and 0.5. `center_cm` is how far the centres of
-pairs at 0.25 lie apart (mean) after the one rigid alignment, `nearest_cm` how far from each true thing the centre of
-any instance lies (median), whether they make a pair or not. With `--keep` memories that are there are not built again.
+1 % and a jump (`simulation/phone.py`). ATE after a rigid alignment; tilt is the angle between the memory's vertical and
+the true one; instances by boxes of the truth at an overlap of 0.25 and 0.5. `center_cm` is the mean distance between
+the centres of pairs at 0.25 after the one rigid alignment, `nearest_cm` the median distance from each true object to
+the nearest centre of an instance, paired or not. With `--keep` existing memories are not built again.
 
-With `--blind` the walk has stretches where the camera cannot be followed by what it sees (`simulation/blind.py`).
-`posed` is how many frames have a pose in the memory, of `frames`; ATE and tilt are of those alone. `posed_blind` and
-`blind_cm` (root mean square) are of the blind stretches alone, `components` the parts that the memory falls into.
+With `--blind` the walk has stretches where the camera cannot be tracked visually (`simulation/blind.py`). `posed` is
+how many frames have a pose in the memory, of `frames`; ATE and tilt are over these frames. `posed_blind` and `blind_cm`
+(root mean square) are of the blind stretches alone, `components` the parts of the memory.
 
-With `--rooms` the walk goes once through five or six rooms and a corridor and comes back to the first, and the phone
-is lowered at doors (`simulation/lowered.py`). A memory may fall into parts that lie apart. Instances are then judged
-twice: `recall` and the like lay each part on the truth by its own cameras, as nobody who asks the memory can, so that
-falling apart costs nothing but what is found twice; `main_recall` and `main_precision` are of the largest part alone.
-`twice` is how many true things two or more instances lie nearest to, by centres within 0.3 m. ATE is of the largest
-part, `part_ate_cm` of all, each laid on the truth by itself.
-`near_recall` and the like lay every instance on the truth by the cameras of the time in which it was seen, in all ways
-alike: what is found, however the map is bent as a whole (which ATE tells); `near_duplicates` is what is found twice.
+With `--rooms` the walk goes once through five or six rooms and a corridor and comes back to the first, and the phone is
+lowered at doors (`simulation/lowered.py`). A memory may have several parts. Instances are then scored twice: `recall`
+and the like align each part with the truth by its own cameras, which a user of the memory cannot do, so that separate
+parts cost only duplicates; `main_recall` and `main_precision` are of the largest part alone. `twice` counts true
+objects that are nearest to two or more instances, by centres within 0.3 m. ATE is of the largest part, `part_ate_cm` of
+all, each aligned by itself. `near_recall` and the like align every instance with the truth by the cameras of its time:
+recall without the deformation of the whole map (which ATE measures); `near_duplicates` counts duplicates.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.walk import PathSettings
 
 PACE = PathSettings(fps=10.0, speed_m_s=1.0, turn_deg_s=70.0)
-"""A brisk walk, of which every third picture of a phone is kept."""
+"""A brisk walk, with every third picture of a phone."""
 MODES = ("given", "prior", "estimate", "true")
 
 
@@ -170,9 +169,8 @@ def in_parts(
     parts: Mapping[int, Trajectory],
     component_of: Mapping[int, int],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Lay each part on the truth by its own cameras. Return figures of the largest and of all, and the scene so laid.
-
-    What lies in a part of fewer than three poses cannot be laid and is left out.
+    """Align each part with the truth by its own cameras. Return figures of the largest and of all, and the aligned
+    scene. Parts of fewer than three poses cannot be aligned and are left out.
     """
     laid, off, main = [], [], None
     for number, path in parts.items():
@@ -203,9 +201,9 @@ def in_their_places(
     parts: Mapping[int, Trajectory],
     known: tuple[Mapping[int, int], Mapping[int, tuple[float, float]]],
 ) -> dict[str, Any]:
-    """Score instances that are each laid on the truth by the cameras of the time in which they were seen.
+    """Score instances, each aligned with the truth by the cameras of its time.
 
-    `known`: the part, and the first and last second of each instance. At least 20 poses lay one.
+    `known`: the part, and the first and last second of each instance. At least 20 poses align one.
     """
     (component_of, seen_s), laid = known, []
     for row in scene["instances"]:
@@ -233,7 +231,7 @@ def moved(row: Mapping[str, Any], S_truth_scene: Sim3) -> dict[str, Any]:
 
 
 def found_twice(scene: Mapping[str, Any], truth: Mapping[str, Any], S_truth_scene: Sim3, reach_m: float = 0.3) -> int:
-    """Return how many true things are the nearest one, within reach, of the centres of two or more instances."""
+    """Return how many true objects are the nearest one, within reach, of the centres of two or more instances."""
     true = np.array([box.center for box in scene_boxes(truth).values()])
     found = np.array([box.center for box in scene_boxes(scene, S_truth_scene).values()]).reshape(-1, 3)
     away = np.linalg.norm(found[:, None] - true[None], axis=2)
@@ -242,7 +240,7 @@ def found_twice(scene: Mapping[str, Any], truth: Mapping[str, Any], S_truth_scen
 
 
 def blind_errors(folder: Path, truth: Trajectory, estimate: Trajectory, S_truth_scene: Sim3) -> dict[str, Any]:
-    """Return how many frames of the blind stretches have a pose, and how far those are from the truth."""
+    """Return how many frames of the blind stretches have a pose, and their error."""
     names = folder / "stretches.json"
     stretches = json.loads(names.read_text()) if names.exists() else []
     blind = {k for k, name in enumerate(stretches) if name != WALKED}
@@ -258,7 +256,7 @@ def blind_errors(folder: Path, truth: Trajectory, estimate: Trajectory, S_truth_
 def nearest_m(
     scene: Mapping[str, Any], truth: Mapping[str, Any], scores: Mapping[str, Any], S_truth_scene: Sim3
 ) -> float:
-    """Median distance from the centre of a true thing that was seen to the nearest one of an instance, metres."""
+    """Median distance from the centre of a true object that was seen to the nearest one of an instance, metres."""
     seen = {row["id"] for row in scores["missed"]} | {true_id for true_id, _, _ in scores["matched_ids"]}
     true = np.array([box.center for k, box in scene_boxes(truth).items() if k in seen])
     found = np.array([box.center for box in scene_boxes(scene, S_truth_scene).values()])

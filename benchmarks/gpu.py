@@ -66,7 +66,7 @@ class OfPi3Size(nn.Module):
         self.points, self.conf = nn.Linear(width, 3 * 196), nn.Linear(width, 196)
 
     def forward(self, imgs: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Pictures (1, n, 3, h, w) to what pi3 gives."""
+        """Pictures (1, n, 3, h, w) to the outputs of pi3."""
         _, count, _, height, width = imgs.shape
         x = self.patches(imgs[0]).flatten(2).transpose(1, 2)
         for block in self.encoder:
@@ -98,7 +98,7 @@ class OfPi3Size(nn.Module):
 
 
 def geometry_network(tiny: bool, device: torch.device) -> tuple[nn.Module, str]:
-    """The network to measure and what it is."""
+    """The network to measure and its name."""
     if tiny:
         return OfPi3Size(32, 2, (1, 2, 1)).to(device).eval(), "toy"
     try:
@@ -169,7 +169,7 @@ def _pass(network: nn.Module, pictures: torch.Tensor, device: torch.device) -> d
 
 
 def measure_tracker(name: str, objects: list[int], tiny: bool, device: torch.device) -> dict[str, Any]:
-    """Seconds for each frame with several numbers of things, and what one more thing costs."""
+    """Seconds per frame for several numbers of objects, and the cost of one more."""
     from list3r.instances.tracking.video_tracker import VideoTracker
 
     frames, reconstruction = _still_chunk(6 if tiny else 24)
@@ -177,10 +177,10 @@ def measure_tracker(name: str, objects: list[int], tiny: bool, device: torch.dev
         _save_tracker(name, Path(folder), tiny)
         tracker = VideoTracker(name, Path(folder), str(device))
     rows = []
-    tracker(frames[:4], _first(reconstruction, 4), [_grid_of_things(1)], "none")  # the first pass loads kernels
+    tracker(frames[:4], _first(reconstruction, 4), [_grid_of_objects(1)], "none")  # the first pass loads kernels
     for count in objects:
         started = time.perf_counter()
-        tracker(frames, reconstruction, [_grid_of_things(count)], "none")
+        tracker(frames, reconstruction, [_grid_of_objects(count)], "none")
         rows.append({"objects": count, "ms_per_frame": round(1e3 * (time.perf_counter() - started) / len(frames), 2)})
     slope, base = np.polyfit([r["objects"] for r in rows], [r["ms_per_frame"] for r in rows], 1)
     return {
@@ -240,7 +240,7 @@ def _first(made: Reconstruction, count: int) -> Reconstruction:
     )
 
 
-def _grid_of_things(count: int) -> Proposals:
+def _grid_of_objects(count: int) -> Proposals:
     """So many rectangles on the first frame."""
     side = int(np.ceil(np.sqrt(count)))
     rows, columns = np.meshgrid(np.arange(240) * side // 240, np.arange(320) * side // 320, indexing="ij")

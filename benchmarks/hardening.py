@@ -41,9 +41,9 @@ def main() -> None:
     problems = 0
     if args.bombs:
         with tempfile.TemporaryDirectory() as folder:
-            told = bombs.run_bombs(Path(folder))
-        Run(args.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(told)
-        problems += len(told["problems"])
+            report = bombs.run_bombs(Path(folder))
+        Run(args.json, "bombs", {"seconds": bombs.MOST_S, "mb": bombs.MOST_MB}).finish(report)
+        problems += len(report["problems"])
     for key, (work, count) in parts.items():
         if count:
             problems += len(_part(key, work, count, args)["problems"])
@@ -55,9 +55,9 @@ def _part(key: str, work: Callable[[Path, int, int], Batch], count: int, args: a
     run = Run(args.json, key, {"tries": batches * EACH, "seed": args.seed})
     with tempfile.TemporaryDirectory(dir=_fast_folder()) as folder:
         run.go(functools.partial(work, Path(folder), args.seed), batches, args.processes)
-    told = run.finish()
-    print(key, json.dumps(told, indent=2), flush=True)
-    return told
+    report = run.finish()
+    print(key, json.dumps(report, indent=2), flush=True)
+    return report
 
 
 def _fast_folder() -> str | None:

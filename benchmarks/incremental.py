@@ -1,22 +1,21 @@
-"""What one more chunk costs as a memory grows, and what memory it takes.
+"""Cost of one more chunk as a memory grows, in time and memory.
 
 python benchmarks/incremental.py --json benchmarks/results/incremental.json
 
-The chunks are made up (things, floors, samples, keyframes of a walk) and go through `mapping.add_chunk` like those of a
-build: edge to the chunk before, revisits, pose graph, library. Three walks: `rooms`, on into new rooms for ever;
-`corridor`, along one floor; `stay`, to and fro in one room, where every chunk touches all that is there. Every chunk
-sees 12 things and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by
-turn. With `--sessions 2` the memory is that of a session that has ended, and the chunks that are added are the first of
-a later one, which walks the way again from its middle; what has changed is told when that session ends, which is timed
-too (`end_s`; of a first session it is that of the library alone, where the build has just ended and nothing has moved
-since). `finish_s` is the whole end of a build, which also solves the graph and lets the chunks bend; in a long chain
-that moves nearly all of them. `edit_s` and `undo_s` are an operator's merge and its undo. Printed are medians: user
-seconds of processor time of placing (edges, revisits, graph) and of the library, things written anew; what the process
-had grown by when the memory was made, and its peak then.
+The chunks are synthetic (objects, floors, samples, keyframes of a walk) and go through `mapping.add_chunk` like those
+of a build: edge to the chunk before, revisits, pose graph, library. Three walks: `rooms`, on into new rooms for ever;
+`corridor`, along one floor; `stay`, to and fro in one room, where every chunk overlaps all others. Every chunk sees 12
+objects and a floor. Memories of several sizes are made, then the same number of chunks is added to each, turn by turn.
+With `--sessions 2` the memory is that of an ended session, and the added chunks are the first of a later one, which
+walks the way again from its middle; its changes are derived when it ends, which is timed too (`end_s`; for a first
+session that of the library alone, just after the build). `finish_s` is the whole end of a build, which also solves the
+graph and the non-rigid correction of chunks; in a long chain that moves nearly all of them. `edit_s` and `undo_s` are
+an operator's merge and its undo. Printed are medians: user seconds of processor time of placing (edges, revisits,
+graph) and of the library, objects written anew; the growth of the process when the memory was made, and its peak then.
 
 `--walks sessions` is another table: a first session of `--first` chunks through rooms, then 19 later ones of `--repeat`
-chunks each, which all walk where the first one began (`same`), or each a part of the way of its own (`apart`). A row
-says what a chunk of a session costs, its end, and the peak of the process.
+chunks each, which all walk where the first one began (`same`), or each along its own part of the way (`apart`). A row
+gives the cost of a chunk of a session, of its end, and the peak of the process.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from list3r.memory.store.store import Store
 from list3r.pipeline import mapping
 
 SEEN, STEP = 12, 6
-"""Things in a chunk, and how many further the next one has gone."""
+"""Objects in a chunk, and how many further the next one has gone."""
 SPACING_M = 0.9
 FRAMES, HOP = 20, 14
 SPACE = "synthetic@1/64"
@@ -132,7 +131,7 @@ def measure(name: str, sizes: list[int], words: argparse.Namespace) -> list[dict
 
 
 def many_sessions(kind: str, words: argparse.Namespace) -> list[dict[str, Any]]:
-    """What a chunk of each of many sessions costs, and the end of the session."""
+    """Cost of a chunk and of the end of each of many sessions."""
     out: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch, Store.create(Path(scratch) / "many.l3r") as store:
         begin(store, words.first)
@@ -162,7 +161,7 @@ def begin(store: Store, chunks: int) -> None:
 
 
 def end(store: Store, session: int) -> float:
-    """End a session: user seconds of the library, its changes told."""
+    """End a session: user seconds of the library and its changes."""
     started = user_s()
     with store.transaction():
         consolidate(store)
@@ -171,8 +170,8 @@ def end(store: Store, session: int) -> float:
 
 
 def finished(store: Store) -> tuple[float, float]:
-    """User seconds of all that a build does last, and the peak of the process: the graph of all chunks is solved, how
-    each bends is found, and what lies elsewhere by that is derived anew.
+    """User seconds of a build's last step, and the peak of the process: the graph of all chunks is solved with their
+    non-rigid correction, and instances of moved chunks are derived again.
     """
     started = user_s()
     mapping.finish_session(store, 1)
@@ -180,7 +179,7 @@ def finished(store: Store) -> tuple[float, float]:
 
 
 def edited(store: Store) -> tuple[float, float]:
-    """User seconds of an operator's merge of two things, and of its undo."""
+    """User seconds of an operator's merge of two objects, and of its undo."""
     a, b = (i.id for i in store.instances.all(structure=False)[:2])
     started = user_s()
     edits.merge(store, a, b, "benchmark")
@@ -190,7 +189,7 @@ def edited(store: Store) -> tuple[float, float]:
 
 
 def again(start: int, turn: int, name: str, seed: int, session: int = 2) -> ChunkResult:
-    """Chunk `turn` of a later session, which sees what the first one saw from chunk `start` on, with other errors."""
+    """Chunk `turn` of a later session: the scene of the first one from chunk `start` on, with other errors."""
     made = chunk(start + turn, name, seed)
     rng = np.random.default_rng([seed, 8, turn, session])
     off = rng.normal(0.0, 0.003, 3)
@@ -220,7 +219,7 @@ def again(start: int, turn: int, name: str, seed: int, session: int = 2) -> Chun
 
 
 def add(store: Store, result: ChunkResult, session: int = 1) -> dict[str, float]:
-    """Add one chunk as a build does: user seconds of placing it and of the library, things written.
+    """Add one chunk as a build does: user seconds of placing it and of the library, objects written.
 
     A chunk of a later session is placed where it is: its keyframes have nothing to be recognised by.
     """
@@ -263,9 +262,9 @@ def chunk(k: int, name: str, seed: int) -> ChunkResult:
     error = rng.normal(0.0, 0.005, 3)
     place = place_of(k, name)
     frames = np.arange(HOP * k, HOP * k + FRAMES)
-    things = [thing(n, STEP * place + n, seed, error, frames, rng) for n in range(SEEN)]
-    things.append(floor(SEEN, place, name, error, frames, rng))
-    links = np.array([(a, b) for a in range(len(things)) for b in range(a)], np.int32)
+    objects = [make_object(n, STEP * place + n, seed, error, frames, rng) for n in range(SEEN)]
+    objects.append(floor(SEEN, place, name, error, frames, rng))
+    links = np.array([(a, b) for a in range(len(objects)) for b in range(a)], np.int32)
     T_chunk_cam = np.stack([camera(int(f), name, error) for f in frames])
     samples = samples_of(k, frames, T_chunk_cam, name, seed, error)
     return ChunkResult(
@@ -282,7 +281,7 @@ def chunk(k: int, name: str, seed: int) -> ChunkResult:
             keyframe(int(f), place, seed, T) for f, T in zip(frames, T_chunk_cam, strict=True) if f % 7 == 0
         ),
         samples=samples,
-        library=LocalLibrary(tuple(things), links, SPACE),
+        library=LocalLibrary(tuple(objects), links, SPACE),
     )
 
 
@@ -298,7 +297,7 @@ def camera(frame: int, name: str, error: np.ndarray) -> np.ndarray:
 def samples_of(
     k: int, frames: np.ndarray, T_chunk_cam: np.ndarray, name: str, seed: int, error: np.ndarray
 ) -> FrameSamples:
-    """Points of things and floor in every frame, the same pixels of one frame in every chunk, with 2 mm of noise."""
+    """Points of objects and floor in every frame, the same pixels of one frame in every chunk, with 2 mm of noise."""
     frame, pixel, points, instance = [], [], [], []
     for f, T in zip(frames.tolist(), T_chunk_cam, strict=True):
         rng = np.random.default_rng([seed, 3, f])
@@ -327,7 +326,7 @@ def samples_of(
 
 
 def keyframe(frame: int, place: int, seed: int, T_chunk_cam: np.ndarray) -> Keyframe:
-    """A keyframe without features; frames of one place look alike."""
+    """A keyframe without features; frames of one place are similar."""
     own = np.random.default_rng([seed, 5, place]).normal(size=WORDS)
     own = own + 0.3 * np.random.default_rng([seed, 6, frame]).normal(size=WORDS)
     return Keyframe(
@@ -342,10 +341,10 @@ def keyframe(frame: int, place: int, seed: int, T_chunk_cam: np.ndarray) -> Keyf
     )
 
 
-def thing(
+def make_object(
     local_id: int, number: int, seed: int, error: np.ndarray, frames: np.ndarray, rng: np.random.Generator
 ) -> LocalInstance:
-    """Thing `number` of the way, always the same: a box that stands on the floor."""
+    """Object `number` of the way, always the same: a box that is on the floor."""
     own = np.random.default_rng([seed, number])
     size = own.uniform(0.15, 0.6, 3)
     center = np.array([SPACING_M * number, own.uniform(-0.4, 0.4), size[2] / 2])

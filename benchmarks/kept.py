@@ -1,9 +1,9 @@
-"""The program with what it reconstructs kept in a folder, and read from there where it is kept already.
+"""The program with a cache of reconstructions in a folder.
 
     LIST3R_KEPT=FOLDER python benchmarks/kept.py build VIDEO -m MEMORY --reconstruction sfm ...
 
-Plane sweeps are most of the time of a build from colour; what is tried after them needs them once. One folder serves
-one video with one camera. Frames and the code of the reconstruction are not looked at: after a change take another.
+Plane sweeps are most of the time of a build from colour; experiments with later steps need them once. One folder is for
+one video with one camera. Frames and the reconstruction's code are not compared: after a change take another.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PLAIN = ("frame_indices", "posed", "T_chunk_cam", "depth", "confidence", "keyfr
 
 
 class Kept:
-    """A model whose answers lie in a folder, by their first and last frame and how many there are."""
+    """A model with cached answers, by their first and last frame and how many there are."""
 
     def __init__(self, model: Reconstructor, folder: Path) -> None:
         self._model, self._folder = model, folder
@@ -47,7 +47,7 @@ class Kept:
         around: Around | None = None,
         deep: Collection[int] | None = None,
     ) -> Sequence[Reconstruction]:
-        """As the model does, where it tells parts apart."""
+        """The model's own, where it has one."""
         parts = getattr(self._model, "parts", None)
         if parts is None:
             return [self(frames, camera)]

@@ -53,7 +53,7 @@ def chunks_in(memory: Path) -> int:
 
 
 def judge(memory: Path, committed: int) -> list[str]:
-    """What is wrong with a memory after a kill."""
+    """Errors of a memory after a kill."""
     if not memory.exists():
         return [f"{committed} committed chunks are gone with the file"] if committed else []
     try:
@@ -69,7 +69,7 @@ def judge(memory: Path, committed: int) -> list[str]:
 
 
 def kill_builds(walk: Path, folder: Path, kills: int, seed: int = 0) -> Result:
-    """Kill builds at random moments; each goes on from what is there, and begins anew once it is done."""
+    """Kill builds at random moments; each resumes, and starts again once it is done."""
     whole, memory = folder / "whole.l3r", folder / "killed.l3r"
     return _kill_runs(
         build_command(walk, whole),
@@ -83,7 +83,7 @@ def kill_builds(walk: Path, folder: Path, kills: int, seed: int = 0) -> Result:
 
 
 def kill_updates(base: Path, walk: Path, folder: Path, kills: int, seed: int = 0) -> Result:
-    """Kill updates of a built memory with a second video; each goes on, and begins anew once it is done."""
+    """Kill updates of a built memory with a second video; each resumes, and starts again once it is done."""
     whole, memory = folder / "updated.l3r", folder / "killed-update.l3r"
     return _kill_runs(
         update_command(walk, whole),
@@ -285,7 +285,7 @@ def edit_for_ever(path: str, seed: int) -> None:
             if len(ids) > 4:
                 a, b = rng.sample(ids, 2)
                 verbs += [
-                    lambda a=a: edits.label(store, a, f"thing {rng.randrange(99)}"),
+                    lambda a=a: edits.label(store, a, f"object {rng.randrange(99)}"),
                     lambda a=a, b=b: edits.merge(store, a, b),
                     lambda a=a: edits.split(store, a),
                     lambda a=a: edits.delete(store, a),
@@ -299,16 +299,16 @@ def edit_for_ever(path: str, seed: int) -> None:
 def kill_edits(memory: Path, kills: int, seed: int = 0) -> Result:
     """Kill a process that merges, splits, labels, deletes and undoes, at random moments.
 
-    What is derived must be what the edits that are left come to.
+    The derived state must be the result of the edits that remain.
     """
     rng = random.Random(seed)
     problems: list[str] = []
     for n in range(kills):
-        told = _killed([str(Path(__file__).resolve()), "--edit", str(memory), str(seed * 1000 + n)], rng, 0.5)
+        report = _killed([str(Path(__file__).resolve()), "--edit", str(memory), str(seed * 1000 + n)], rng, 0.5)
         problems += judge(memory, 0)
         with Store.open(memory) as store:
             entries = {e.entry for e in store.edits.all()}
-        lost = sorted(set(told) - entries)
+        lost = sorted(set(report) - entries)
         if lost:
             problems.append(f"edits {lost} were committed and are lost")
         problems += _underived(memory)
@@ -317,7 +317,7 @@ def kill_edits(memory: Path, kills: int, seed: int = 0) -> Result:
 
 
 def _underived(memory: Path) -> list[str]:
-    """Whether the library is another than what the chunks and the edits come to."""
+    """Whether the library differs from the result of the chunks and the edits."""
     with Store.open(memory, writable=True) as store:
         before = scene_dict(store)
         with store.transaction():
@@ -355,7 +355,7 @@ def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
 def _edit_command(memory: Path, ids: list[int], known: set[int], rng: random.Random) -> list[str]:
     a, b = (str(n) for n in rng.sample(ids, 2))
     path = str(memory)
-    verbs = [["label", path, a, f"thing {rng.randrange(99)}"]]
+    verbs = [["label", path, a, f"object {rng.randrange(99)}"]]
     if len(ids) > 5:
         verbs += [["merge", path, a, b], ["delete", path, a]]
     if known:

@@ -1,7 +1,7 @@
-"""What a camera that comes again and again could know of where things are.
+"""The most that a camera of repeated visits can know of the places of objects.
 
-A thing that was taken away is not missed before a frame sees through where it stood, so that a change is due at the
-visit that could first see it, not at the one before which it was made.
+An object that was taken away is not missed before a frame sees through where it was, so a change is due at the first
+visit that could see it, not at the first after it.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from list3r.evaluation.scene import read_scene
 from list3r.evaluation.trajectory import read_tum
 
 _LEAST_FRAMES, _LEAST_SHARE, _BEHIND_M = 3, 0.6, 0.05
-"""Frames that must see a place empty; the share of it that they must see through, to what lies this much farther."""
+"""Frames that must see a place empty; the share of it that they must see through, to a surface this much farther."""
 _INSIDE = 0.3
-"""Of its size, how far from its middle a thing is looked for."""
+"""Search radius round an object's centre, as a share of its size."""
 _GRID = np.array(list(product((-_INSIDE, 0.0, _INSIDE), repeat=3)))
 
-Thing = dict[str, Any]
+Entry = dict[str, Any]
 Changes = set[tuple[str, int]]
 
 
 class KnownPlaces:
-    """Where the camera last saw things, visit by visit."""
+    """Where the camera last saw objects, visit by visit."""
 
     def __init__(self, walks: Sequence[Path]) -> None:
-        self.scenes = [_things(walk) for walk in walks]
+        self.scenes = [_entries(walk) for walk in walks]
         self._visits = [_Visit(walk) for walk in walks]
-        self.known: list[dict[int, Thing]] = []
-        """By visit: the things by id where they were last seen, but for those whose places were seen empty since."""
+        self.known: list[dict[int, Entry]] = []
+        """By visit: the objects by id where they were last seen, without those with places seen empty since."""
         self.changes: list[Changes] = []
-        """By visit: kind and id of what it could be the first to see."""
+        """By visit: kind and id of changes that it could be the first to see."""
         for n, scene in enumerate(self.scenes):
             seen = {t: e for t, e in scene.items() if e["largest_px"] >= MIN_PX}
             before = self.known[-1] if self.known else {}
@@ -48,7 +48,7 @@ class KnownPlaces:
             self.changes.append(self._changes(n, before, self.known[-1]))
 
     def due(self, n: int) -> Due:
-        """What a memory could tell of a visit, counted from 0."""
+        """Changes that a memory could report of a visit, counted from 0."""
         return Due(
             self.changes[n],
             self._besides(n),
@@ -56,26 +56,26 @@ class KnownPlaces:
         )
 
     def _besides(self, n: int) -> Changes:
-        """Changes that it would be no error to tell at a visit: of what the camera saw too little of."""
+        """Changes without a penalty at a visit: of objects that the camera saw too little of."""
         now = self.scenes[n]
         out = _differences(self.known[n - 1], now) | _differences(self.scenes[n - 1], now)
         out |= {("added", t) for t in now if t not in self.known[n - 1]}
         out |= {(kind, t) for k, t in out if k == "moved" for kind in ("removed", "added")}
         return out - self.changes[n]
 
-    def _changes(self, n: int, before: dict[int, Thing], now: dict[int, Thing]) -> Changes:
+    def _changes(self, n: int, before: dict[int, Entry], now: dict[int, Entry]) -> Changes:
         found = _differences(before, now) if n else set()
         known = {t for places in self.known[:n] for t in places}
         came = {t for k, t in found if k == "added" and t not in known}
         return found - {("added", t) for t in came if not any(v.sees_empty(now[t]) for v in self._visits[:n])}
 
-    def _empty(self, n: int, thing: Thing) -> bool:
-        """Whether a visit sees that a thing is not where it was: the place is empty, or something else has it."""
-        if self._visits[n].sees_empty(thing):
+    def _empty(self, n: int, obj: Entry) -> bool:
+        """Whether a visit sees that an object is not where it was: the place is empty, or something else has it."""
+        if self._visits[n].sees_empty(obj):
             return True
-        at, half = (np.array(thing["box"][k]) for k in ("center", "size"))
-        others = [e for t, e in self.scenes[n].items() if t != thing["id"] and e["largest_px"] >= MIN_PX]
-        gone = is_elsewhere(thing, self.scenes[n].get(thing["id"]))
+        at, half = (np.array(obj["box"][k]) for k in ("center", "size"))
+        others = [e for t, e in self.scenes[n].items() if t != obj["id"] and e["largest_px"] >= MIN_PX]
+        gone = is_elsewhere(obj, self.scenes[n].get(obj["id"]))
         return gone and any((np.abs(np.array(e["box"]["center"]) - at) < half / 2).all() for e in others)
 
 
@@ -89,15 +89,15 @@ class _Visit:
         ]
         self._camera = np.loadtxt(walk / "calibration.txt").reshape(-1)[:4]
 
-    def sees_empty(self, thing: Thing) -> bool:
-        """Whether frames see through the place of a thing."""
-        seen = sum(self._sees_through(thing, T, depth) for T, depth in self._frames)
+    def sees_empty(self, obj: Entry) -> bool:
+        """Whether frames see through the place of an object."""
+        seen = sum(self._sees_through(obj, T, depth) for T, depth in self._frames)
         return seen >= _LEAST_FRAMES
 
-    def _sees_through(self, thing: Thing, T_cam_world: NDArray[np.float64], depth: NDArray[np.float32]) -> bool:
+    def _sees_through(self, obj: Entry, T_cam_world: NDArray[np.float64], depth: NDArray[np.float32]) -> bool:
         fx, fy, cx, cy = self._camera
-        center, size = (np.array(thing["box"][k]) for k in ("center", "size"))
-        turned = Rotation.from_quat(thing["box"]["quat_wxyz"], scalar_first=True)
+        center, size = (np.array(obj["box"][k]) for k in ("center", "size"))
+        turned = Rotation.from_quat(obj["box"]["quat_wxyz"], scalar_first=True)
         p = (center + turned.apply(_GRID * size)) @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
         if (p[:, 2] < 0.3).any():
             return False
@@ -109,11 +109,11 @@ class _Visit:
         return float(np.mean(depth[v, u] > p[:, 2] + _BEHIND_M)) >= _LEAST_SHARE
 
 
-def _things(walk: Path) -> dict[int, Thing]:
+def _entries(walk: Path) -> dict[int, Entry]:
     return {e["id"]: e for e in read_scene(walk / "truth.json")["instances"] if not e["structure"]}
 
 
-def _differences(before: dict[int, Thing], now: dict[int, Thing]) -> Changes:
+def _differences(before: dict[int, Entry], now: dict[int, Entry]) -> Changes:
     moved = {("moved", t) for t in before.keys() & now.keys() if is_elsewhere(before[t], now[t])}
     return (
         moved

@@ -1,4 +1,4 @@
-"""What ties frames of colour video where nothing can be followed: SIFT and ALIKED by the same code.
+"""Matching of colour frames that cannot be tracked: SIFT and ALIKED by the same code.
 
     python benchmarks/links.py --source ../shared/data/redkitchen --intrinsics 525,525,320,240 --every 20 \
         --weights ../shared/weights --json benchmarks/results/links.json

@@ -3,9 +3,9 @@
 python benchmarks/live.py --seconds 600 --readers 8 --cuts 5 --json benchmarks/results/live.json
 
 Pictures of a simulated walk are served as motion JPEG at 15 a second, forth and back; `list3r build URL` follows them
-as structure from motion with a known camera. Each reader opens the memory, asks for what is nearest to some point and
-for all relations, and holds that every id in the answers is one of the memory's. At the end Ctrl-C ends the session,
-and `verify` looks at every row.
+as structure from motion with a known camera. Each reader opens the memory, asks for the instances nearest to some point
+and for all relations, and checks that every id in the answers is one of the memory's. At the end Ctrl-C ends the
+session, and `verify` checks every row.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Reader(threading.Thread):
                 asked = {m.instance.id for m in scene.nearest((0.0, 0.0, 0.0), k=5)} if ids else set()
                 related = {n for r in scene.relations() for n in (r.subject, r.object)}
                 if not (asked | related) <= ids | {i.id for i in scene.store.instances.all()}:
-                    self.wrong.append("an answer names what is not in the memory")
+                    self.wrong.append("an answer names an id that is not in the memory")
         except List3rError as error:
             if "is being" not in str(error) and "no memory" not in str(error):
                 self.wrong.append(str(error))

@@ -99,22 +99,22 @@ def write_walk(root: Path, frames: int) -> None:
 
 
 def run(source: Path, memory: Path, stop: int | None, *, resume: bool) -> list[dict[str, Any]]:
-    """Build, killed after `stop` frames; what was told at every eighth of the frames and last."""
+    """Build, killed after `stop` frames; the progress at every eighth of the frames and last."""
     command = [sys.executable, "-c", REPORT, str(source), str(memory), str(int(resume))]
-    told: list[dict[str, Any]] = []
+    report: list[dict[str, Any]] = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             row = json.loads(line)
             eighth = 8 * row["frames"] // max(1, row["of"])
-            if not told or row["frames"] < 0 or eighth > 8 * told[-1]["frames"] // told[-1]["of"]:
-                told.append(row)
+            if not report or row["frames"] < 0 or eighth > 8 * report[-1]["frames"] // report[-1]["of"]:
+                report.append(row)
                 print(json.dumps(row), flush=True)
             if stop is not None and row["frames"] >= stop:
                 os.kill(process.pid, signal.SIGKILL)
                 break
     time.sleep(0.1)
-    return told
+    return report
 
 
 if __name__ == "__main__":

@@ -3,8 +3,7 @@
     python benchmarks/long_plan.py [--frames 1000000] [--kinds list,video] [--json FILE]
 
 `list` is a folder whose list of frames names a hundred tiny pictures over and over, `video` a file of tiny pictures
-copied over and over. Each is measured in a process of its own. The plan is that of a build that goes on, to which cuts
-are known.
+copied over and over. Each is measured in its own process. The plan is that of a resumed build with known cuts.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def resident_mb() -> float:
 
 
 def measure(video: Path, memory: Path, every: int, chunks: int) -> dict[str, Any]:
-    """List the video, look through it and build its first chunks."""
+    """List the video, scan it and build its first chunks."""
     at_start, begun, cpu = resident_mb(), time.monotonic(), time.process_time()
     source = open_source(video)
     listing = {

@@ -1,4 +1,4 @@
-"""What the benchmarks print of the machine and of a process they measured."""
+"""Facts of the machine and of a measured process, for the benchmarks."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run_list3r(*arguments: str, kept: Path | None = None) -> tuple[dict[str, Any
 
 
 def _end_with_starter() -> None:
-    """Let this process be told to end when the one that started it does, however that ends; on Linux."""
+    """Let this process end with its parent, however that ends; on Linux."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG of <sys/prctl.h>
 
@@ -64,8 +64,8 @@ def _end_with_starter() -> None:
 def _watch(process: subprocess.Popen[str]) -> float:
     """Peak of the summed set sizes of a process and its descendants, bytes.
 
-    A look walks through all their pages: ten times a second cost an eighth of two processors beside a build of 2.5 GB.
-    So there are ten a second at the most, and fewer where they would take more than 3 % of a processor's time.
+    A sample walks through all their pages: ten a second took an eighth of two processors during a build of 2.5 GB. So
+    there are ten a second at most, and fewer where they would take more than 3 % of a processor's time.
     """
     peak, spent = 0.0, time.process_time()
     while True:
@@ -137,11 +137,11 @@ def _follow(parent: int) -> None:
 
 
 STARTED_AT = commit()
-"""The code may change while a long benchmark runs; what was loaded is what was there at the start."""
+"""The code may change while a long benchmark runs; the loaded code is that of the start."""
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Write a result beside the machine and the commit that it was measured on; temporary folders are not named."""
+    """Write a result next to the machine and the commit that it was measured on; temporary folders are not named."""
     if path is not None:
-        told = json.dumps({"machine": machine(), "commit": STARTED_AT, **result}, indent=2)
-        path.write_text(re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+", "...", told) + "\n", encoding="utf-8")
+        written = json.dumps({"machine": machine(), "commit": STARTED_AT, **result}, indent=2)
+        path.write_text(re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+", "...", written) + "\n", encoding="utf-8")

@@ -154,7 +154,7 @@ def main() -> None:
     parser.add_argument("--depth-every", type=int, help="depth of every n-th frame; default: as a build does")
     parser.add_argument("--poses", choices=("sfm", "rgbd", "given"), default="sfm", help="where the poses come from")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cuda compares CPU and GPU")
-    parser.add_argument("--intrinsics", help="fx,fy,cx,cy of the colour camera where the source does not tell")
+    parser.add_argument("--intrinsics", help="fx,fy,cx,cy of the colour camera where the source does not give it")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -1,4 +1,5 @@
-"""How right the names of things are in one chunk, also in places that others furnished, and the weights that say so.
+"""Precision of the names of objects in one chunk, also in places that others furnished, and fitting of their
+confidence.
 
 PYTHONPATH=. python benchmarks/names.py --left-out 6001-6010 --left-out-fitted 6101-6106 --keep FOLDER
 PYTHONPATH=. python benchmarks/names.py --place .../worlds/office_small.world=1-24 --keep FOLDER
@@ -6,10 +7,10 @@ PYTHONPATH=. python benchmarks/names.py --left-out 5000-5011 --left-out-fitted 5
     --fitted 8300-8302 --odd 8600-8605 --keep FOLDER --fit
 
 Rooms are those of `training/worlds`; `--left-out` ones have kinds, textures and a sensor that training never shows,
-`--odd` ones things without a name. A place is a file of a Gazebo world, or the folder of one. All that is listed and
-no structure is judged: its name is right if the true thing that it fits best by voxels, with an IoU of 0.25, is called
-so; what fits none, or a thing that none of the names goes with, can only be named wrongly. `--fit` prints the
-`NameConfidence` fitted to what is given, the kinds of rooms weighing the same.
+`--odd` ones objects without a name. A place is a file of a Gazebo world, or the folder of one. All listed instances
+without structure are scored: a name is right if the best matching true object by voxels, with an IoU of 0.25, has it;
+any name of an instance without a match, or of an object without a known name, is wrong. `--fit` prints the
+`NameConfidence` fitted to the given rooms, all kinds with equal weight.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from list3r.instances.learned.discovery import LearnedSettings
 from list3r.instances.learned.graph import chunk_surface
 from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs
 from list3r.instances.learned.pieces import cut_pieces
-from list3r.instances.learned.things import first_verdicts, names_of, thing_features
+from list3r.instances.learned.verdicts import first_verdicts, names_of, segment_features
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import SegmentSettings
 from training.graphs import surroundings_of
@@ -96,12 +97,12 @@ CALLED = {
     r"door\w*|(Folding)?Door": "door",
     r"window\w*|RoomWindow": "window",
 }
-"""What models of places that others furnished may be called; the first that fits counts."""
+"""Names of models of places that others furnished; the first match counts."""
 
 
 @dataclass(frozen=True)
 class Named:
-    """The T listed things of a chunk."""
+    """The T listed objects of a chunk."""
 
     signs: NameSigns
     before: NDArray[np.float64]
@@ -109,7 +110,7 @@ class Named:
     right: NDArray[np.bool_]
     """Whether the likeliest name is right. Shape (T,)."""
     nameable: NDArray[np.bool_]
-    """Whether it fits a thing that one of the names goes with. Shape (T,)."""
+    """Whether it fits an object that one of the names goes with. Shape (T,)."""
 
 
 def main() -> None:
@@ -117,14 +118,14 @@ def main() -> None:
     for kind in ("left-out", "left-out-fitted", "room", "fitted", "odd"):
         parser.add_argument(f"--{kind}", default="", help="seeds, such as 1-3,7")
     parser.add_argument("--place", action="append", default=[], metavar="PATH=SEEDS", help="walks in a Gazebo world")
-    parser.add_argument("--keep", type=Path, required=True, help="folder of what was found; what is there is kept")
+    parser.add_argument("--keep", type=Path, required=True, help="folder of results; existing ones are kept")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--json", type=Path)
     words = vars(parser.parse_args())
     found: dict[str, list[Named]] = {}
     for group, name, make in _samples(words):
         found.setdefault(group, []).append(_kept(words["keep"] / f"{name}.npz", make))
-        print(name, len(found[group][-1].right), "things", flush=True)
+        print(name, len(found[group][-1].right), "objects", flush=True)
     table = {group: summary(rows) for group, rows in found.items()}
     print(machine())
     for group, entry in table.items():
@@ -160,7 +161,7 @@ def _walk(place: Path, seed: int) -> Callable[[], Sample]:
 
 
 def _kept(path: Path, make: Callable[[], Sample]) -> Named:
-    """The things of a chunk, judged unless they are there."""
+    """The objects of a chunk, judged unless they are there."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, **listed(make()))  # type: ignore[arg-type]
@@ -178,21 +179,21 @@ def _kept(path: Path, make: Callable[[], Sample]) -> Named:
 
 
 def _calls(label: str) -> frozenset[str]:
-    """The names that a true thing may have."""
+    """The names that a true object may have."""
     if label in LABELS:
         return frozenset([label])
     return frozenset(next((n for p, n in CALLED.items() if re.fullmatch(p, label)), "").split("|")) - {""}
 
 
 def listed(sample: Sample) -> dict[str, NDArray[Any]]:
-    """Features and verdicts of the things of a chunk, and what each fits best by voxels and how well."""
+    """Features and verdicts of the objects of a chunk, and the best match of each by voxels, with its IoU."""
     weights = load_weights(sensed=not sample.computed)
     cloud = sample.cloud(SegmentSettings().grain_m(sensed=not sample.computed))
     truth = sample.truth_of(cloud).astype(np.int64)
     surface = chunk_surface(cloud, sample.views, surroundings_of(sample))
-    parts, graph, told = join_parts(surface, cut_pieces(surface), weights, CutSettings())
-    own = agglomerate(len(graph.nodes), graph.left, graph.right, told.affinity, graph.weight, CutSettings().enough)
-    structure, x = thing_features(own, graph, told)
+    parts, graph, scores = join_parts(surface, cut_pieces(surface), weights, CutSettings())
+    own = agglomerate(len(graph.nodes), graph.left, graph.right, scores.affinity, graph.weight, CutSettings().enough)
+    structure, x = segment_features(own, graph, scores)
     whole, names = first_verdicts(weights, x)
     cluster = np.append(own, -1)[parts]
     shared = np.zeros((len(x), int(truth.max()) + 1))
@@ -206,7 +207,7 @@ def listed(sample: Sample) -> dict[str, NDArray[Any]]:
 
 
 def summary(rows: Sequence[Named]) -> dict[str, Any]:
-    """What is named and how much of that is right, from several probabilities on, as the judge says and as believed."""
+    """Coverage and precision of names from several probabilities on, with calibrated and raw confidence."""
     belief = NameConfidence()
     nameable = np.concatenate([r.nameable for r in rows])
     out: dict[str, Any] = {"walks": len(rows), "things": len(nameable), "nameable": int(nameable.sum())}
@@ -215,15 +216,15 @@ def summary(rows: Sequence[Named]) -> dict[str, Any]:
         p = np.concatenate(said)
         entry: dict[str, Any] = {**calibration(p, right)}
         for t in LEAST:
-            told = p >= t
-            share = round(float(told[nameable].mean()), 3)
-            entry[f"from_{t:g}"] = {"named": int(told.sum()), "wrong": int((told & ~right).sum()), "coverage": share}
+            named = p >= t
+            share = round(float(named[nameable].mean()), 3)
+            entry[f"from_{t:g}"] = {"named": int(named.sum()), "wrong": int((named & ~right).sum()), "coverage": share}
         out[word] = entry
     return out
 
 
 def fitted(groups: Sequence[Sequence[Named]]) -> NameConfidence:
-    """The weights under which what is right is likeliest, each group weighing the same."""
+    """Maximum-likelihood weights, each group with equal weight."""
     signs = [r.signs for rows in groups for r in rows]
     x = np.concatenate([np.column_stack([s.odds, s.whole, np.full(len(s.odds), s.others)]) for s in signs])
     y = np.concatenate([r.right for rows in groups for r in rows]).astype(float)

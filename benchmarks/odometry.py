@@ -1,13 +1,13 @@
-"""How well and how fast the rgbd reconstruction follows a camera, without loops.
+"""Accuracy and speed of the rgbd reconstruction's tracking, without loops.
 
 PYTHONPATH=. python benchmarks/odometry.py --seeds 7301-7340 --json benchmarks/results/odometry.json
 PYTHONPATH=. python benchmarks/odometry.py --house FOLDER/aws-robomaker-small-house-world --seeds 1-6
 PYTHONPATH=. python benchmarks/odometry.py --source .../redkitchen [--beside-open3d]
 
 Walks of 120 frames, nine a second, through left-out rooms of `training/worlds` or the house, with a sensor's noise and
-an exposure that changes; or the chunks of a source that knows its poses. An error is how far, and by what angle, the
-motion over eight frames that all have a pose is off; where it is more than 5 cm the camera has slipped. With
-`--beside-open3d` Open3D's dense frame-to-model tracking (`t.pipelines.slam`) follows the same frames.
+an exposure that changes; or the chunks of a source with poses. An error is that of the motion over eight frames that
+all have a pose, as distance and angle; more than 5 cm is a slip. With `--beside-open3d` Open3D's dense frame-to-model
+tracking (`t.pipelines.slam`) follows the same frames.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SENSORS = ("structured", "lidar", "tof")
 
 @dataclass(frozen=True)
 class Walk:
-    """Frames of which the poses are known, not finite where they are not."""
+    """Frames with known poses, not finite where unknown."""
 
     name: str
     frames: list[Frame]
@@ -101,7 +101,7 @@ def chunks_of(path: Path) -> Iterator[Walk]:
     source = open_source(path)
     camera, missing = source.info.camera, np.full((4, 4), np.nan)
     if camera is None:
-        raise SystemExit(f"{path} does not tell its camera; give frames with depth, poses and a camera")
+        raise SystemExit(f"{path} has no camera; give frames with depth, poses and a camera")
     for span in plan_chunks(source.info.frame_count, ChunkSettings()):
         frames = [f for f in source.read(span.start, span.stop) if isinstance(f, Frame)]
         poses = np.stack([missing if f.T_source_cam is None else f.T_source_cam for f in frames])

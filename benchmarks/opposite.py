@@ -1,11 +1,11 @@
-"""Rendered walks with depth that see a room again from its other end: does the whole program join the two parts?
+"""Rendered walks with depth that see a room again from its other end: does a build join the two parts?
 
 python benchmarks/opposite.py --seeds 201-204 --json FILE
 
 The end of one run and another run of `benchmarks.simulation.returns`, 320 x 240 with a sensor's noise, are one video
 with a cut. `list3r build --poses estimate` makes a memory of it: real features, real discovery, metric depth. A part is
-joined by frames where an accepted loop across the cut was found by frames that look alike, else by things. The error is
-that of the second part when the world is laid on the truth by the first.
+joined by frames where an accepted loop across the cut was found by frame similarity, else by instances. The error is
+that of the second part after alignment with the truth by the first.
 """
 
 from __future__ import annotations
@@ -55,34 +55,34 @@ def one_home(root: Path, preset: str, seed: int) -> dict[str, Any]:
 
 
 def measure(store: Store, truth: Trajectory, cut: int) -> dict[str, Any]:
-    """What joined the two parts, and how far the second lies off."""
+    """How the two parts were joined, and the error of the second."""
     chunks = {c.chunk_id: c for c in store.chunks.all()}
     across = [
         e for e in store.edges.all() if e.kind == "loop" and chunks[e.u].last_frame < cut <= chunks[e.v].first_frame
     ]
-    things = [e for e in across if "things_pairs" in e.scores]
+    by_instances = [e for e in across if "things_pairs" in e.scores]
     poses = [(f.frame_index, S) for f, S in store.trajectory.poses()]
     component = {c.component for c in chunks.values()}
-    told = {
+    report = {
         "chunks": len(chunks),
         "components": len(component),
         "instances": store.instances.count(),
-        "by_frames": sum(e.accepted for e in across if e not in things),
-        "by_things": sum(e.accepted for e in things),
-        "reasons": [e.reason for e in things],
+        "by_frames": sum(e.accepted for e in across if e not in by_instances),
+        "by_things": sum(e.accepted for e in by_instances),
+        "reasons": [e.reason for e in by_instances],
     }
     rows = np.array([k for k, _ in poses])
     path = np.stack([_rigid(S) for _, S in poses])
     parts = [rows < cut, rows >= cut]
     if len(component) > 1 or not all(p.any() for p in parts):
-        return told
+        return report
     first = rows[parts[0]]
     known = Trajectory(truth.time_s[first], truth.T_world_cam[first])
     S_truth_world = align(known, Trajectory(truth.time_s[first], path[parts[0]]), with_scale=False)
     error = np.linalg.inv(truth.T_world_cam[rows[parts[1]]]) @ _moved(S_truth_world, path[parts[1]])
     turn = np.degrees(np.arccos(np.clip((np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
     off = np.linalg.norm(error[:, :3, 3], axis=1)
-    return told | {"off_m": round(float(np.median(off)), 4), "off_deg": round(float(np.median(turn)), 3)}
+    return report | {"off_m": round(float(np.median(off)), 4), "off_deg": round(float(np.median(turn)), 3)}
 
 
 def _rigid(S: Any) -> Any:

@@ -1,8 +1,8 @@
-"""report.html of a large memory in a browser: how long until it can be searched, and a search.
+"""report.html of a large memory in a browser: time until it can be searched, and of a search.
 
 PYTHONPATH=. python benchmarks/pages.py --instances 1000,100000 --json benchmarks/results/pages.json
 
-The memories are made up (`exporters.py`). The page is opened from disk in Chromium without a screen; times are wall
+The memories are synthetic (`exporters.py`). The page is opened from disk in Chromium without a screen; times are wall
 seconds on the machine as it is, and processor seconds of all of the browser's processes.
 """
 
@@ -58,19 +58,19 @@ def main() -> None:
 
 
 def measure(page: Browser, report: Path) -> dict[str, Any]:
-    """Seconds until the page lists things, what a search takes, and what the page holds in memory."""
+    """Seconds until the page lists instances, seconds of a search, and the page's memory."""
     used, began = cpu_seconds(page), time.monotonic()
     page.open(report.as_uri())
     page.wait(lambda: page.run(f"document.readyState === 'complete' && {ROWS} > 0"), 300)
-    told: dict[str, Any] = {
+    row: dict[str, Any] = {
         "open_s": round(time.monotonic() - began, 2),
         "open_cpu_s": round(cpu_seconds(page) - used, 2),
     }
-    told["heap_mb"] = round(page.run("performance.memory.usedJSHeapSize") / 1e6)
-    told["search_ms"] = {word: round(page.run(SEARCH % word)) for word in ("zzz", "#77", "stuhl", "plant on table", "")}
+    row["heap_mb"] = round(page.run("performance.memory.usedJSHeapSize") / 1e6)
+    row["search_ms"] = {word: round(page.run(SEARCH % word)) for word in ("zzz", "#77", "stuhl", "plant on table", "")}
     page.run(SEARCH % "stuhl")
-    told["found"] = page.run("document.getElementById('count').textContent")
-    return {**told, "load_average": round(os.getloadavg()[0], 1), "console_errors": page.errors}
+    row["found"] = page.run("document.getElementById('count').textContent")
+    return {**row, "load_average": round(os.getloadavg()[0], 1), "console_errors": page.errors}
 
 
 if __name__ == "__main__":

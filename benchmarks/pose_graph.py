@@ -207,7 +207,7 @@ def uncertainty(chunks: int, edges: int, seed: int) -> dict[str, Any]:
 
 
 def full(chunks: int, edges: int, seed: int, metric: bool) -> dict[str, Any]:
-    """Plain least squares from the chain, beside gtsam's Levenberg-Marquardt."""
+    """Plain least squares from the chain, compared with gtsam's Levenberg-Marquardt."""
     w = walk(chunks, edges, seed, metric=metric)
     start = chained(w.edges, take(w.truth, np.array(0)))
     u, v = np.array([e.u for e in w.edges]), np.array([e.v for e in w.edges])
@@ -285,7 +285,7 @@ def gnc(w: Walk, start: Sim3, weights: Array | None) -> tuple[Sim3, NDArray[np.b
 
 
 def false_loops(chunks: int, edges: int, seed: int, alike: bool, drift: float = 1.0) -> dict[str, Any]:
-    """The same graph without and with 30 % false loops; gtsam's GNC (truncated least squares) beside it. `drift` times
+    """The same graph without and with 30 % false loops; gtsam's GNC (truncated least squares) next to it. `drift` times
     as large as stated are the errors of adjacent edges."""
     clean, spoilt = (drifting(walk(chunks, edges, seed, *bad), drift, seed) for bad in ((0.0, False), (0.3, alike)))
     first = {0: take(clean.truth, np.array(0))}
@@ -324,7 +324,7 @@ def false_loops(chunks: int, edges: int, seed: int, alike: bool, drift: float = 
 
 
 def drifting(w: Walk, times: float, seed: int) -> Walk:
-    """The walk with adjacent edges whose errors are larger than they state, as those of bent chunks are."""
+    """The walk with overconfident adjacent edges, as those of bent chunks."""
     if times == 1.0:
         return w
     rng = np.random.default_rng(seed + 1000)

@@ -1,10 +1,10 @@
-"""How many questions scene.md answers as the memory does, by budget of tokens and size of the memory.
+"""Share of questions that scene.md answers like the memory, by budget of tokens and size of the memory.
 
-    python benchmarks/prompt_pack.py [MEMORY ...] [--things 10 100 1000 5000] [--questions 200] [--out FILE.json]
+    python benchmarks/prompt_pack.py [MEMORY ...] [--objects 10 100 1000 5000] [--questions 200] [--out FILE.json]
 
-A plain program reads nothing but the text. It is asked which thing is nearest to one, what holds it, how many of a name
-there are, how far two things are apart and in which direction. `general` is one text for all questions; `asked` is a
-text made for each question (of every tenth of them), whose ids it names.
+A plain program reads only the text. Questions: the nearest instance, the support, the count of a name, distance and
+direction between two instances. `general` is one text for all questions; `asked` is a text made for each question (of
+every tenth of them), whose ids it names.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class Question:
 def questions(memory: SceneMemory, count: int) -> Iterator[Question]:
     """Questions with their answers, of all kinds in turn."""
     rng = np.random.default_rng(0)
-    things = memory.instances()
+    objects = memory.instances()
     held = [(r.subject, r.object) for p in SUPPORTING for r in memory.relations(predicate=p)]
     names = Counter(name_of(i) for i in memory.instances(structure=None))
     for n in range(count):
-        a, b = (things[k] for k in rng.choice(len(things), 2, replace=False))
+        a, b = (objects[k] for k in rng.choice(len(objects), 2, replace=False))
         kind = KINDS[n % len(KINDS)]
         if kind == "nearest":
             near = memory.nearest(a.id, k=2)
@@ -78,7 +78,7 @@ def questions(memory: SceneMemory, count: int) -> Iterator[Question]:
 
 
 def made_memory(path: Path, count: int) -> None:
-    """A house of `count` things on tables in a row of rooms."""
+    """A house of `count` objects on tables in a row of rooms."""
     rng = np.random.default_rng(count)
     instances, relations, table = [], [], 0
     for n in range(1, count + 1):
@@ -110,7 +110,7 @@ def _instance(n: int, name: str, center: np.ndarray, size: np.ndarray, confidenc
 
 
 class Reader:
-    """What a plain program makes of the text; lengths in metres."""
+    """A plain program's reading of the text; lengths in metres."""
 
     def __init__(self, text: str, units: str) -> None:
         scale = 100.0 if units == "m" else 1.0
@@ -140,7 +140,7 @@ class Reader:
                     self.held[n] = int(holder[1])
 
     def answers(self, q: Question) -> bool:
-        """Whether the text says what the memory says."""
+        """Whether the text agrees with the memory."""
         if q.kind == "count":
             return (self.total or self.names).get(q.of[0]) == q.answer
         if q.kind == "held":
@@ -191,14 +191,14 @@ def measure(memory: SceneMemory, count: int) -> list[dict[str, Any]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("memories", nargs="*", type=Path)
-    parser.add_argument("--things", nargs="*", type=int, default=[10, 100, 1000, 5000])
+    parser.add_argument("--objects", nargs="*", type=int, default=[10, 100, 1000, 5000])
     parser.add_argument("--questions", type=int, default=200)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         paths = list(options.memories)
-        for count in options.things:
+        for count in options.objects:
             paths.append(Path(folder) / f"made-{count}.l3r")
             made_memory(paths[-1], count)
         for path in paths:

@@ -1,12 +1,12 @@
-"""What others read in the exports of real memories: counts, ids, boxes and relations against the store, and validators.
+"""Exports of real memories as read by other libraries: counts, ids, boxes and relations against the store, and
+validators.
 
 python benchmarks/receivers.py MEMORY.l3r ... --json benchmarks/results/receivers.json
 
 Instances and relations of the store are read back from scene JSON, GraphML, node-link JSON, CSV, Parquet and USD
-(points alone, and meshes with colliders), each by a library that is not ours; corners of boxes from the transforms of
-the USD stage. Then usd-core's validators, and by `scripts/validate_usd.sh` NVIDIA's over both stages and the scene of
-props, and Robotics-Prop 4.0.0 over each prop (`--no-nvidia` leaves these out). Status 1 where anything differs or
-complains.
+(points alone, and meshes with colliders), each by another library; corners of boxes from the transforms of the USD
+stage. Then usd-core's validators, and by `scripts/validate_usd.sh` NVIDIA's over both stages and the scene of props,
+and Robotics-Prop 4.0.0 over each prop (`--no-nvidia` leaves these out). Status 1 where anything differs or complains.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ Triple = tuple[int, str, int]
 
 
 @dataclass(frozen=True)
-class Told:
-    """What one file says of a memory."""
+class Reading:
+    """Content of one file about a memory."""
 
     ids: list[int]
     relations: list[Triple]
@@ -66,23 +66,23 @@ def main() -> None:
 
 
 def examined(path: Path, folder: Path, *, nvidia: bool) -> dict[str, Any]:
-    """Export a memory and hold what is read back against it."""
+    """Export a memory, read the files back and compare."""
     with list3r.open(path) as memory:
         store = stored(memory)
         metric = memory.units == "m"
-        told: dict[str, Told] = {}
+        report: dict[str, Reading] = {}
         for name, (form, file, read) in READERS.items():
             if form != "parquet" or importlib.util.find_spec("pyarrow"):
                 memory.export(form, folder / file, **({"colliders": True} if name == "usd meshes" else {}))
-                told[name] = read(folder / file)
+                report[name] = read(folder / file)
         if metric:
             memory.export("simready", folder / "props", density=DENSITY)
     stages = [folder / file for form, file, _ in READERS.values() if form == "usd"]
     row: dict[str, Any] = {
         "instances": len(store.ids),
         "relations": len(store.relations),
-        "agree": {name: agrees(store, found) for name, found in told.items()},
-        "box_mm": round(1e3 * max((off(store, found) for found in told.values()), default=0.0), 6),
+        "agree": {name: agrees(store, found) for name, found in report.items()},
+        "box_mm": round(1e3 * max((off(store, found) for found in report.values()), default=0.0), 6),
         "usd_core_errors": sum(len(complaints(stage)) for stage in stages),
     }
     if nvidia:
@@ -96,23 +96,23 @@ def examined(path: Path, folder: Path, *, nvidia: bool) -> dict[str, Any]:
     return row
 
 
-def stored(memory: list3r.SceneMemory) -> Told:
-    """Return what the memory says itself."""
+def stored(memory: list3r.SceneMemory) -> Reading:
+    """Return the content of the memory itself."""
     instances = memory.instances(structure=None)
-    return Told(
+    return Reading(
         sorted(i.id for i in instances),
         sorted((r.subject, r.predicate, r.object) for r in memory.relations()),
         {i.id: i.box.corners() for i in instances if has_box(i)},
     )
 
 
-def agrees(store: Told, found: Told) -> bool:
-    """Tell whether ids and relations are the same, each as often."""
+def agrees(store: Reading, found: Reading) -> bool:
+    """Return whether ids and relations are the same, each as often."""
     return found.ids == store.ids and found.relations == store.relations
 
 
-def off(store: Told, found: Told) -> float:
-    """Return how far corners of boxes lie from where they should, at most; infinite where a box is absent."""
+def off(store: Reading, found: Reading) -> float:
+    """Return how far corners of boxes are from where they should, at most; infinite where a box is absent."""
     if not found.corners:
         return 0.0
     if set(found.corners) != set(store.corners):
@@ -123,47 +123,49 @@ def off(store: Told, found: Told) -> float:
 # ------------------------------------------------------------------------------------------------ readers
 
 
-def read_scene(path: Path) -> Told:
+def read_scene(path: Path) -> Reading:
     """Read a scene JSON."""
     scene = json.loads(path.read_text(encoding="utf-8"))
-    return Told(
+    return Reading(
         sorted(i["id"] for i in scene["instances"]),
         sorted((r["subject"], r["predicate"], r["object"]) for r in scene["relations"]),
     )
 
 
-def read_graph(path: Path) -> Told:
+def read_graph(path: Path) -> Reading:
     """Read GraphML or node-link JSON with networkx."""
     if path.suffix == ".graphml":
         graph = networkx.read_graphml(path, node_type=int, force_multigraph=True)
     else:
         graph = networkx.node_link_graph(json.loads(path.read_text(encoding="utf-8")), edges="edges")
-    return Told(sorted(graph), sorted((a, d["predicate"], b) for a, b, d in graph.edges(data=True)))
+    return Reading(sorted(graph), sorted((a, d["predicate"], b) for a, b, d in graph.edges(data=True)))
 
 
-def read_csv(path: Path) -> Told:
+def read_csv(path: Path) -> Reading:
     """Read both tables of CSV."""
-    things, relations = (
+    objects, relations = (
         list(csv.DictReader(p.open(encoding="utf-8", newline=""))) for p in (path, path.with_name("c.relations.csv"))
     )
-    return Told(
-        sorted(int(r["id"]) for r in things),
+    return Reading(
+        sorted(int(r["id"]) for r in objects),
         sorted((int(r["subject"]), r["predicate"], int(r["object"])) for r in relations),
     )
 
 
-def read_parquet(path: Path) -> Told:
+def read_parquet(path: Path) -> Reading:
     """Read both tables of Parquet with pyarrow."""
     import pyarrow.parquet as pq
 
-    things, relations = (pq.read_table(p).to_pylist() for p in (path, path.with_name("p.relations.parquet")))
-    return Told(sorted(r["id"] for r in things), sorted((r["subject"], r["predicate"], r["object"]) for r in relations))
+    rows, relations = (pq.read_table(p).to_pylist() for p in (path, path.with_name("p.relations.parquet")))
+    return Reading(
+        sorted(r["id"] for r in rows), sorted((r["subject"], r["predicate"], r["object"]) for r in relations)
+    )
 
 
-def read_usd(path: Path) -> Told:
+def read_usd(path: Path) -> Reading:
     """Read a stage with usd-core."""
     stage = Usd.Stage.Open(str(path))
-    ids = {p.GetPath(): p.GetAttribute("list3r:id").Get() for p in stage.Traverse(_all()) if _is_thing(p)}
+    ids = {p.GetPath(): p.GetAttribute("list3r:id").Get() for p in stage.Traverse(_all()) if _is_object(p)}
     relations, corners = [], {}
     unit = np.array([[i, j, k, 1.0] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
     for place, instance_id in ids.items():
@@ -176,18 +178,18 @@ def read_usd(path: Path) -> Told:
         if box:
             T = np.array(UsdGeom.Imageable(box).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
             corners[instance_id] = (unit @ T)[:, :3]
-    return Told(sorted(ids.values()), sorted(relations), corners)
+    return Reading(sorted(ids.values()), sorted(relations), corners)
 
 
 def _all() -> Any:
     return Usd.PrimIsActive & Usd.PrimIsDefined & ~Usd.PrimIsAbstract
 
 
-def _is_thing(prim: Usd.Prim) -> bool:
+def _is_object(prim: Usd.Prim) -> bool:
     return bool(prim.HasAttribute("list3r:id"))
 
 
-READERS: dict[str, tuple[str, str, Callable[[Path], Told]]] = {
+READERS: dict[str, tuple[str, str, Callable[[Path], Reading]]] = {
     "json": ("json", "s.json", read_scene),
     "graphml": ("graphml", "g.graphml", read_graph),
     "node-link": ("node-link", "n.json", read_graph),
@@ -196,14 +198,14 @@ READERS: dict[str, tuple[str, str, Callable[[Path], Told]]] = {
     "usd": ("usd", "points.usdc", read_usd),
     "usd meshes": ("usd", "meshes.usdc", read_usd),
 }
-"""By name: the format, the file, and what reads it."""
+"""By name: the format, the file, and its reader."""
 
 
 # --------------------------------------------------------------------------------------------- validators
 
 
 def complaints(path: Path) -> list[str]:
-    """Return what usd-core's own validators say of a stage."""
+    """Return the findings of usd-core's own validators in a stage."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     stage = Usd.Stage.Open(str(path))
     return [e.GetMessage() for e in UsdValidation.ValidationContext(validators).Validate(stage)]

@@ -1,10 +1,10 @@
-"""A real RGB-D sequence whose chunks are each given a random similarity: association must find the scale itself.
+"""A real RGB-D sequence with a random similarity for each chunk: association must find the scale itself.
 
 python benchmarks/regauge.py --source SEQUENCE [--seeds 1,2,3] --json FILE
 
-Every chunk is reconstructed as in a build; then its rotation, place and scale (log-normal, 0.3) are thrown away before
-it is added, and joint windows come back in a random gauge of their own. Printed: ATE after Sim(3) alignment of the
-metric build and of each regauged one, and their ratio.
+Every chunk is reconstructed as in a build; then its pose and scale (log-normal, 0.3) are discarded before it is added,
+and joint windows come in a random gauge. Printed: ATE after Sim(3) alignment of the metric build and of each regauged
+one, and their ratio.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def measure(
 
 
 class _Regauged:
-    """A joint reconstructor whose windows come in a random gauge."""
+    """A joint reconstructor with windows in a random gauge."""
 
     def __init__(self, inner: Any, rng: np.random.Generator) -> None:
         self._inner, self._rng = inner, rng

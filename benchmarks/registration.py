@@ -1,20 +1,19 @@
-"""Registration by things alone, in simulated homes that are seen again from elsewhere or changed.
+"""Registration by objects alone, in simulated homes that are seen again from elsewhere or changed.
 
 python benchmarks/registration.py --preset opposite --seeds 161-180 --json FILE
 python benchmarks/registration.py --preset opposite --seeds 161-180 --sensor --json FILE
 
 A home is filmed twice (`benchmarks.simulation.returns`): rooms and at last one of them, then that room again. The
-chunks of the first run are put into a memory by the program itself. Then those of the second run arrive, and after them
-those of another home; for each, `find_loops` says what it is joined to. No joint window is at hand and keyframes hold
-no features, so that nothing but things can join what the cut separates. Masks are as discovery makes them in homes that
-it never saw, looks change with the side and with the light. What joins a chunk is kept out of the memory, so that each
-is judged for itself.
+chunks of the first run are put into a memory by the program itself. Then those of the second run follow, and after them
+those of another home; for each, `find_loops` returns its edges. There is no joint window and keyframes have no
+features, so that only instances can join the runs. Masks are as of discovery in unseen homes, appearance changes with
+the side and with the light. Edges are not added to the memory, so that each chunk is scored alone.
 
-A relation is right when it puts what the older chunk saw within 0.35 m and 8 degrees of where it is (chunks bend, and a
-scale that is 5 % off moves a far wall by 0.2 m); how many lie within 0.1 m and 3 degrees is told beside. A home is
-joined when a relation is believed that is right; its error is that of the best supported one, as the pose graph places
-it by all that is believed. With `--sensor` the geometry is that of a depth sensor: metric, chunks bent by millimetres;
-masks and looks are as bad as without.
+A relation is right when its error at the older chunk's points is within 0.35 m and 8 degrees (chunks are deformed, and
+a scale error of 5 % moves a far wall by 0.2 m); the number within 0.1 m and 3 degrees is given too. A home is joined
+when a correct relation is accepted; its error is that of the best supported one, placed by the pose graph with all
+accepted ones. With `--sensor` the geometry is that of a depth sensor: metric, chunks bent by millimetres; masks and
+appearance are as bad as without.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ def main() -> None:
 
 
 def summary(pairs: list[dict[str, Any]]) -> dict[str, Any]:
-    """What was joined, how rightly and how well."""
+    """Joined homes, precision and errors."""
     homes = sorted({p["seed"] for p in pairs})
     believed = [p for p in pairs if p["believed"]]
     best = {s: max((p for p in believed if p["seed"] == s), key=lambda p: p["support"], default=None) for s in homes}
@@ -81,7 +80,7 @@ def summary(pairs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 class Home:
-    """Chunks of both runs of a home; of each run those that `kept` names."""
+    """Chunks of both runs of a home; of each run the ones named by `kept`."""
 
     def __init__(
         self, preset: str, seed: int, sensor: bool = False, kept: tuple[slice, slice] = (slice(None), slice(None))
@@ -153,7 +152,7 @@ def _sensor() -> Any:
 
 
 def judged_loops(store: Any, chunk_id: int, truth: dict[int, Any], same: bool) -> list[dict[str, Any]]:
-    """What things say of where a chunk lies, and how far that is from the truth."""
+    """Registration of a chunk by objects, and its error."""
     from list3r.association.revisits.search import find_loops
 
     edges = [e for e in find_loops(store, chunk_id) if "things_pairs" in e.scores]
@@ -172,7 +171,7 @@ def judged_loops(store: Any, chunk_id: int, truth: dict[int, Any], same: bool) -
 
 
 def _off(store: Any, truth: dict[int, Any], u: int, v: int, S_v_u: Any) -> tuple[float, float]:
-    """How far a relation puts what u saw from where it is: metres (median) and degrees."""
+    """Error of a relation at the points of u: metres (median) and degrees."""
     error = truth[v] @ S_v_u @ truth[u].inverse()
     points = store.chunks.samples(u).points
     points = truth[u].apply(points[np.isfinite(points).all(axis=1)][::40].astype(np.float64))

@@ -1,16 +1,15 @@
-"""Relations of simulated homes held against the truth, with the masks of things taken from the truth.
+"""Relations of simulated homes against the truth, with the true masks of objects.
 
 python benchmarks/relations.py --seeds 1,2,3,4 --json benchmarks/results/relations.json
 
-The pictures, depth noise, poses, tracking, merging and all rules are those of a build; only which pixels belong to
-which thing is told, so that the geometry and the rules are measured and not the discovery (`benchmarks/simulated.py`
-measures both together). Walls and ceilings do not count, and all floors are one. A thing counts when it was seen in 12
-frames and once covered 300 pixels of 320 x 240.
-What stands half on a rug is not asked where it stands; next_to_decided leaves out pairs within 3 cm of the bound (two
-deviations of a measured gap). Every claim counts, whatever its confidence. near and attached_to (to the right wall)
-are measured beside them, and what is told when it is asked for: left, right, front and behind of things near each
-other from every 30th camera, and what is between two things.
-The same memory with gravity set to unknown must make no vertical claim.
+The pictures, depth noise, poses, tracking, merging and all rules are those of a build; only the masks are given, so
+that the geometry and the rules are measured without discovery (`benchmarks/simulated.py` measures both together). Walls
+and ceilings do not count, and all floors are one. An object counts when it was seen in 12 frames and once covered 300
+pixels of 320 x 240. Objects half on a rug have no support in the truth; next_to_decided leaves out pairs within 3 cm of
+the bound (two deviations of a measured gap). Every claim counts, whatever its confidence. near and attached_to (to the
+right wall) are measured too, and the relations derived on demand: left, right, front and behind of objects near each
+other from every 30th camera, and between two objects. The same memory with gravity set to unknown must make no vertical
+claim.
 """
 
 from __future__ import annotations
@@ -45,14 +44,14 @@ from list3r.pipeline.settings import BuildSettings
 from list3r.queries.relations import VERTICAL
 from list3r.simulation.dataset import WalkSettings, frame_name, write_walk
 from list3r.simulation.worlds.gaps import surface_gap
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.truth import NEXT_TO_M
 
 MIN_PX, MIN_FRAMES = 300, 12
 PREDICATES = ("on", "in", "next_to", "near")
 ASKED = ("viewpoint", "between")
 CLOSE_M = 0.03
-"""Pairs whose gap lies nearer to the bound of next_to than two deviations of a measured gap are close calls."""
+"""Pairs with a gap nearer to the bound of next_to than two deviations of a measured gap are undecided."""
 
 
 def main() -> None:
@@ -79,21 +78,21 @@ def main() -> None:
         print(f"{name:16} {pooled[name]}")
     vertical = sum(r["vertical_without_gravity"] for r in rows)
     print(f"vertical relations without gravity: {vertical}")
-    things = statistics.fmean(r["things"] for r in rows)
+    objects = statistics.fmean(r["things"] for r in rows)
     print(machine())
-    write_json(args.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": things, "seeds": rows})
+    write_json(args.json, {"pooled": pooled, "vertical_without_gravity": vertical, "things": objects, "seeds": rows})
 
 
 def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
-    """One home: build it from told masks, and compare."""
+    """One home: build it from given masks, and compare."""
     walk, memory = root / f"walk-{seed}", root / f"memory-{seed}.l3r"
     if not (walk / "truth.json").exists():
         write_walk(walk, WalkSettings(seed=seed, write_ids=True))
     truth = _truth(walk)
     memory.unlink(missing_ok=True)
     with Store.create(memory) as store:
-        told = build(store, walk, truth, poses)
-        truth_of = _most_common(store, told)
+        report = build(store, walk, truth, poses)
+        truth_of = _most_common(store, report)
         claimed = [(r.subject, r.predicate, r.object) for r in store.relations.all()]
         kept = {i for i, e in truth.items() if e["frames_seen"] >= MIN_FRAMES and e["largest_px"] >= MIN_PX}
         matched = {k: v for k, v in truth_of.items() if v in kept}
@@ -106,7 +105,7 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
         on_walls = {k: v for k, v in truth_of.items() if v in kept}
         attached = evaluate_relations(_relations(walk), claimed, on_walls, ("attached_to",)).total
         near = {(s, o) for s, p, o in true if p == "near"}
-        told_when_asked = asked(store, WalkSettings(seed=seed), matched, near)
+        derived = asked(store, WalkSettings(seed=seed), matched, near)
         with store.transaction():
             store.facts.gravity = "unknown"
         vertical = _vertical_without_gravity(store)
@@ -115,14 +114,14 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
         row[name] = {"true": entry.true_count, "claimed": entry.estimated_count, "correct": entry.correct}
     names = {i: f"{e['label']}#{i}" for i, e in truth.items()}
     close = _close_calls(seed)
-    beside = {(s, o) for s, p, o in true if p == "next_to"} - close
+    neighbours = {(s, o) for s, p, o in true if p == "next_to"} - close
     wrong = {(s, o) for s, p, o in errors.wrong if p == "next_to"} - close
     missed = {(s, o) for s, p, o in errors.missed if p == "next_to"} - close
-    counted = {pair for pair in beside if set(pair) <= set(matched.values())}
+    counted = {pair for pair in neighbours if set(pair) <= set(matched.values())}
     correct = len(counted) - len(missed)
     row["attached_to"] = {"true": attached.true_count, "claimed": attached.estimated_count, "correct": attached.correct}
     for name in ASKED:
-        row[name] = {k: told_when_asked[f"{name}_{k}"] for k in ("true", "claimed", "correct")}
+        row[name] = {k: derived[f"{name}_{k}"] for k in ("true", "claimed", "correct")}
     row["next_to_decided"] = {"true": len(counted), "claimed": correct + len(wrong), "correct": correct}
     row["wrong"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.wrong]
     row["missed"] = [f"{names[s]} {p} {names[o]}" for s, p, o in errors.missed]
@@ -131,26 +130,26 @@ def measure(seed: int, poses: str, root: Path) -> dict[str, Any]:
 
 
 def build(store: Store, walk: Path, truth: dict[int, dict[str, Any]], poses: str) -> dict[tuple[int, int], int]:
-    """Add all chunks with told masks; the true id of every local instance."""
+    """Add all chunks with given masks; the true id of every local instance."""
     settings = BuildSettings("rgbd", poses, keep_pictures=False)
     source = open_source(walk, SourceOptions())
     with store.transaction():
         store.facts.scale_kind = "metric"
         store.facts.poses = poses
         session = store.sessions.add(str(walk), "", {"poses": poses}, source.info.frame_count)
-    told: dict[tuple[int, int], int] = {}
+    report: dict[tuple[int, int], int] = {}
     for span in plan_chunks(source.info.frame_count, settings.chunks):
         discoverer = ToldMasks(walk, truth, settings.instances)
         result = process_parts(ChunkTask(str(walk), SourceOptions(), span, settings), discoverer)[-1]
         chunk = add_chunk(store, session, result)
         for instance in result.library.instances:
-            told[chunk, instance.local_id] = _true_id(walk, instance.track)
+            report[chunk, instance.local_id] = _true_id(walk, instance.track)
     finish_session(store, session)
-    return told
+    return report
 
 
 class ToldMasks:
-    """A discoverer that reads the ids of the things from the truth."""
+    """A discoverer that reads the ids of the objects from the truth."""
 
     feature_space = FEATURE_SPACE
 
@@ -158,7 +157,7 @@ class ToldMasks:
         self._walk, self._truth, self._settings = walk, truth, settings
 
     def __call__(self, frames: Any, reconstruction: Any, position: int) -> Proposals:
-        """What is in view on the frame at `position`, each thing once."""
+        """True masks on the frame at `position`, each object once."""
         views = chunk_views(frames, reconstruction, self._settings)
         view = views.view(position)
         ids = _ids(self._walk, int(frames[position].index))
@@ -166,8 +165,8 @@ class ToldMasks:
         present = [int(k) for k in np.flatnonzero(area >= 20) if int(k) in self._truth]
         labels = np.zeros(ids.shape, np.int32)
         features = []
-        for number, thing in enumerate(present):
-            mask = ids == thing
+        for number, obj in enumerate(present):
+            mask = ids == obj
             labels[mask] = number + 1
             small = mask[:: views.stride, :: views.stride] & view.confirmed
             up = -view.T_chunk_cam[:3, 1]
@@ -197,7 +196,7 @@ def _ids(walk: Path, index: int) -> np.ndarray:
 
 
 def _true_id(walk: Path, track: Any) -> int:
-    """The thing that most of a track's masks lie on."""
+    """The object that most of a track's masks are on."""
     from list3r.memory.masks import decode_mask
 
     votes: Counter[int] = Counter()
@@ -208,11 +207,11 @@ def _true_id(walk: Path, track: Any) -> int:
     return votes.most_common(1)[0][0]
 
 
-def _most_common(store: Store, told: dict[tuple[int, int], int]) -> dict[int, int]:
-    """True id of every global instance; of several instances of one thing the one with most observations counts."""
+def _most_common(store: Store, report: dict[tuple[int, int], int]) -> dict[int, int]:
+    """True id of every global instance; of several instances of one object the one with most observations counts."""
     votes: dict[int, Counter[int]] = {}
     for seen in store.observations.all():
-        votes.setdefault(seen.instance_id, Counter())[told[seen.chunk_id, seen.local_id]] += 1
+        votes.setdefault(seen.instance_id, Counter())[report[seen.chunk_id, seen.local_id]] += 1
     best: dict[int, tuple[int, int]] = {}
     for instance, counter in sorted(votes.items()):
         true, count = counter.most_common(1)[0]
@@ -222,11 +221,11 @@ def _most_common(store: Store, told: dict[tuple[int, int], int]) -> dict[int, in
 
 
 def _close_calls(seed: int) -> set[tuple[int, int]]:
-    """Pairs of things of which nobody who measures to a few centimetres can say whether they are next to each other."""
-    things = [t for t in WalkSettings(seed=seed).world().things if t.structure is None]
+    """Pairs of objects for which next_to is undecided at an error of a few centimetres."""
+    objects = [t for t in WalkSettings(seed=seed).world().objects if t.structure is None]
     close = set()
-    for a in things:
-        for b in things:
+    for a in objects:
+        for b in objects:
             if a.id != b.id:
                 limit = float(np.clip(0.25 * (a.box().size.max() + b.box().size.max()), *NEXT_TO_M))
                 if abs(limit - surface_gap(a, b)) < CLOSE_M:
@@ -235,36 +234,36 @@ def _close_calls(seed: int) -> set[tuple[int, int]]:
 
 
 def _without(triples: list[Triple], torn: set[tuple[int, int]], truth_of: dict[int, int] | None = None) -> list[Triple]:
-    """The triples less what is not asked: on what things stand that are half on a rug, and whether they are near it."""
-    things = {thing for thing, _ in torn}
-    pairs = torn | {(rug, thing) for thing, rug in torn}
+    """The triples without excluded ones: support of objects half on a rug, and whether they are near it."""
+    objects = {obj for obj, _ in torn}
+    pairs = torn | {(rug, obj) for obj, rug in torn}
     named = [(s, o) if truth_of is None else (truth_of.get(s), truth_of.get(o)) for s, _, o in triples]
     return [
         t
         for t, (s, o) in zip(triples, named, strict=True)
-        if not (t[1] == "on" and s in things) and not (t[1] == "near" and (s, o) in pairs)
+        if not (t[1] == "on" and s in objects) and not (t[1] == "near" and (s, o) in pairs)
     ]
 
 
 def _between_rug_and_floor(seed: int) -> set[tuple[int, int]]:
-    """Things that stand with some feet on a rug and with some beside it, neither being the answer; with the rug."""
-    things = WalkSettings(seed=seed).world().things
+    """Objects with some feet on a rug and some next to it, where neither is the answer; with the rug."""
+    objects = WalkSettings(seed=seed).world().objects
     torn = set()
-    for rug_id, rug in ((t.id, t.box()) for t in things if t.label == "rug"):
-        for thing in things:
-            feet = [b for b in part_boxes(thing) if b.center[2] - b.size[2] / 2 < 0.05]
-            if thing.structure is None and thing.label != "rug" and feet:
+    for rug_id, rug in ((t.id, t.box()) for t in objects if t.label == "rug"):
+        for obj in objects:
+            feet = [b for b in part_boxes(obj) if b.center[2] - b.size[2] / 2 < 0.05]
+            if obj.structure is None and obj.label != "rug" and feet:
                 away = [np.abs((b.center - rug.center) @ rug.rotation)[:2] - rug.size[:2] / 2 for b in feet]
                 over = [bool((a < 0).all()) for a in away]
                 if any(over) and not all(over):
-                    torn.add((thing.id, rug_id))
+                    torn.add((obj.id, rug_id))
     return torn
 
 
-def part_boxes(thing: SimulatedThing) -> list[OrientedBox]:
-    """The box of each part of a thing in the world."""
-    rotation, position = thing.rotation(), np.array(thing.position)
-    corners = [part.extent() for part in thing.parts]
+def part_boxes(obj: SimulatedObject) -> list[OrientedBox]:
+    """The box of each part of an object in the world."""
+    rotation, position = obj.rotation(), np.array(obj.position)
+    corners = [part.extent() for part in obj.parts]
     return [OrientedBox(position + rotation @ ((low + high) / 2), high - low, rotation) for low, high in corners]
 
 

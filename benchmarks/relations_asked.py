@@ -1,4 +1,4 @@
-"""Relations that are told when they are asked for, held against the truth: by viewpoint, and between two things.
+"""Relations derived on demand, against the truth: by viewpoint, and between two objects.
 
 The truth applies the definitions of `list3r/queries/viewpoint.py` to the true boxes and the true camera.
 """
@@ -16,21 +16,21 @@ from list3r.memory.store.store import Store
 from list3r.queries.relations import noise_of, viewer_from
 from list3r.queries.views.viewpoint import Viewpoint, between, viewed
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 
 EVERY = 30
 """Frames from one asked viewpoint to the next."""
 APART_M = 1.5
-"""Things whose centres lie further apart are not asked what is between them."""
+"""Between is not asked for objects with centres further apart."""
 Counts = dict[str, int]
 
 
 def asked(store: Store, settings: WalkSettings, truth_of: Mapping[int, int], near: set[tuple[int, int]]) -> Counts:
     """Counts of true, claimed and right answers. `near` holds the pairs of true ids that viewpoints are asked of."""
-    things = {t.id: t for t in settings.world().things}
-    found = {truth_of[i.id]: i for i in store.instances.all() if truth_of.get(i.id) in things and i.structure is None}
-    found = {k: i for k, i in found.items() if things[k].structure is None}
-    true = {k: _true(i, things[k]) for k, i in found.items()}
+    objects = {t.id: t for t in settings.world().objects}
+    found = {truth_of[i.id]: i for i in store.instances.all() if truth_of.get(i.id) in objects and i.structure is None}
+    found = {k: i for k, i in found.items() if objects[k].structure is None}
+    true = {k: _true(i, objects[k]) for k, i in found.items()}
     out = _from_viewpoints(store, settings, found, true, near)
     return out | _between(found, true, noise_of(store))
 
@@ -80,8 +80,8 @@ def _counts(name: str, want: set[tuple[object, ...]], said: set[tuple[object, ..
     return {f"{name}_true": len(want), f"{name}_claimed": len(said), f"{name}_correct": len(want & said)}
 
 
-def _true(instance: Instance, thing: SimulatedThing) -> Instance:
-    box = thing.box()
+def _true(instance: Instance, obj: SimulatedObject) -> Instance:
+    box = obj.box()
     corners = box.corners()
     low_high = np.stack([corners.min(axis=0), corners.max(axis=0)])
-    return replace(instance, id=thing.id, center=box.center, box=box, aabb=low_high, position_sigma_m=None)
+    return replace(instance, id=obj.id, center=box.center, box=box, aabb=low_high, position_sigma_m=None)

@@ -3,8 +3,8 @@ bytes, truncation.
 
     python benchmarks/safety.py --kills 200 --minutes 5 --flips 1000 --json benchmarks/results/safety.json
 
-Every process is real. The whole takes about half an hour on a quiet core; a part is written to the file as it is done,
-and the same command with --resume goes on after the last one.
+Every process is real. The whole takes about half an hour on a quiet core; each part is written to the file when it is
+done, and --resume continues after the last one.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from list3r.simulation.dataset import WalkSettings, write_walk
 
 Result = dict[str, Any]
 _ROUND, _HELD = Fact[int]("round", int, 0), Fact[int]("held", int, 0)
-"""What a writer says of the transaction it wrote last: its number, and how many instances it left."""
+"""A writer's last transaction: its number, and the count of instances after it."""
 
 
 # ------------------------------------------------------------------------------------------- readers
@@ -71,7 +71,7 @@ def write_and_read(memory: Path, seconds: float, readers: int = 8) -> Result:
 
 
 def _worker(work: Callable[..., Any], memory: str, seconds: float, k: int, queue: Any, ready: Any) -> None:
-    """Run one process and report what it met; all begin together."""
+    """Run one process and report its errors; all begin together."""
     end_with_parent()
     problems: list[str] = []
     count = 0
@@ -131,7 +131,7 @@ def _read(memory: str, end: float, k: int, problems: list[str]) -> int:
 
 
 def torn(store: Store) -> list[str]:
-    """What does not fit together in one snapshot."""
+    """Inconsistencies of one snapshot."""
     instances = store.instances.all()
     ids = {i.id for i in instances}
     n, held = store.facts[_ROUND], store.facts[_HELD] or len(ids)
@@ -156,7 +156,7 @@ def torn(store: Store) -> list[str]:
 
 
 def flip(memory: Path, folder: Path, count: int, seed: int = 0) -> Result:
-    """Damage copies of a memory and look at what opening, reading and `verify` make of it; in a process of its own."""
+    """Damage copies of a memory and test opening, reading and `verify`; in its own process."""
     outcomes: Counter[str] = Counter()
     problems: list[str] = []
     context = multiprocessing.get_context("spawn")
@@ -208,7 +208,7 @@ def damaged(original: bytes, rng: random.Random) -> tuple[bytes, str]:
 
 
 def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
-    """(detected at open, detected by reading, detected by verify, harmless, silent or traceback, what was done)."""
+    """(detected at open, detected by reading, detected by verify, harmless, silent or traceback, the damage)."""
     try:
         store = Store.open(copy)
     except MemoryFileError:
@@ -225,7 +225,7 @@ def outcome_of(copy: Path, wanted: Any, what: str) -> tuple[str, str]:
     except Exception as error:
         return "traceback", f"{what}: {type(error).__name__}: {error}"
     if not same(got, wanted):
-        return "silent", f"{what}: the answers are others"
+        return "silent", f"{what}: the answers differ"
     try:
         with Store.open(copy) as again:
             if again.verify():
@@ -315,7 +315,7 @@ def main() -> None:
 
 
 def _parts(folder: Path, args: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Name of each part and what does it, in order; what several need is made when the first of them does."""
+    """Name and function of each part, in order; shared inputs are made by the first that needs them."""
     seed, runs = args.seed, 3 * args.kills // 10
     edits, writes = (args.kills - 2 * runs) // 4, (args.kills - 2 * runs) // 4
     made = _Memories(folder)
@@ -326,7 +326,7 @@ def _parts(folder: Path, args: argparse.Namespace) -> Iterator[tuple[str, Callab
         ("kills while editing", kill_edits, edits),
         ("kills of commands that edit", kill_commands, args.kills - 2 * runs - edits - writes),
     ):
-        # A file of its own for each: what a killed writer left beside one belongs to no other.
+        # A file of its own for each: leftovers of a killed writer belong to one file only.
         yield part, lambda k=kill, n=count: k(_copy(made.updated, k.__name__), n, seed + 2)
     yield "flips", lambda: flip(made.built, folder, args.flips, seed)
     yield "repairs", lambda: repair_flips(made.built, folder, args.flips // 10, seed + 1)

@@ -1,12 +1,13 @@
-"""How a memory answers as it grows: 1,000 to 1,000,000 instances, beside a NumPy scan and an embedded vector database.
+"""Latency of a memory as it grows: 1,000 to 1,000,000 instances, compared with a NumPy scan and an embedded vector
+database.
 
 python benchmarks/scale.py --instances 1000,1000000 --json benchmarks/results/scale.json
 
-The instances are made up and written through the store's own verbs: rooms of 5 x 5 x 3 m side by side, 30 things in
-each, relations to the neighbours, features of 256 numbers in families that lie apart by design (`features`). They have
-no measured surfaces, so distances are to their boxes. Each size runs in a process of its own. Where each vector
-belongs is kept in the cache of the user (`$LIST3R_CACHE`); here that is beside the memories. LanceDB is the other
-database (pip install lancedb): its index of a million vectors takes 45 s of processor time, the process 4 GB.
+The instances are synthetic and written through the store's own verbs: rooms of 5 x 5 x 3 m side by side, 30 objects in
+each, relations to the neighbours, features of 256 numbers in families that are apart by design (`features`). They have
+no measured surfaces, so distances are to their boxes. Each size runs in its own process. The index of vectors is kept
+in the cache of the user (`$LIST3R_CACHE`); here next to the memories. LanceDB is the other database (pip install
+lancedb): its index of a million vectors takes 45 s of processor time, the process 4 GB.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ from list3r.queries.within import within
 SPACE = "synthetic@1/256"
 DIMENSION = 256
 ROOM_M = np.array([5.0, 5.0, 3.0])
-THINGS = 30
+OBJECTS = 30
 BATCH = 20_000
 COLORS = "white black grey red orange yellow green teal blue purple brown pink".split()
 SHAPES = "box cylinder sheet slab panel object table sphere".split()
 INDEXED = 5_000
 """Up to so many vectors LanceDB has no index: its product codes want that many to learn from."""
 NOUNS = 200
-"""Labels that one thing in fifty has."""
+"""Labels that one object in fifty has."""
 Floats = NDArray[np.float64]
 QUESTIONS = {
     "label": "noun7",
@@ -56,7 +57,7 @@ QUESTIONS = {
     "kinds": "red box near blue table",
     "nothing": "zebra",
 }
-"""What `find` is asked."""
+"""Phrases of `find`."""
 
 
 def main() -> None:
@@ -119,7 +120,7 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
 
     row |= timed("similar", [lambda n=n: ask(n) for n in range(len(asked))])
     row["resident_mb"] = resident_mb()
-    row |= beside(store, points, asked, found, database=database)
+    row |= peers(store, points, asked, found, database=database)
     row |= timed("one_more_chunk", [lambda n=n: one_more_chunk(store, int(n), count) for n in range(20)], warm=1)
     row |= timed("similar_after_chunk", [lambda v=v: similar(store, vector=v, space=SPACE, k=10) for v in asked[:20]])
     store.close()
@@ -136,8 +137,8 @@ def measure(count: int, questions: int, seed: int, folder: Path, *, database: bo
 
 
 def cold(path: Path, points: Floats) -> dict[str, float]:
-    """`nearest` in a memory just opened, of whose file nothing is in the system's cache: once at the start, or before
-    each question, when only what SQLite keeps is left of those before.
+    """`nearest` in a memory just opened, with its file not in the system's cache: dropped once at the start, or before
+    each question, so that only SQLite's own cache remains.
     """
     out: dict[str, float] = {}
     for name, each in (("nearest_cold", False), ("nearest_cold_each", True)):
@@ -154,7 +155,7 @@ def cold(path: Path, points: Floats) -> dict[str, float]:
 
 
 def leave_cache(path: Path) -> None:
-    """Let the system forget what it keeps of a file."""
+    """Drop a file from the system's cache."""
     file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)
@@ -163,12 +164,12 @@ def leave_cache(path: Path) -> None:
         os.close(file)
 
 
-# ---------------------------------------------------------------------------------------------- what is written
+# -------------------------------------------------------------------------------------------------- writes
 
 
 def rooms(count: int) -> Floats:
     """Extent of the world: rooms in a square, one floor. Shape (3,)."""
-    side = int(np.ceil(np.sqrt(np.ceil(count / THINGS))))
+    side = int(np.ceil(np.sqrt(np.ceil(count / OBJECTS))))
     return np.array([side, side, 1.0]) * ROOM_M
 
 
@@ -184,17 +185,17 @@ def write_memory(path: Path, count: int, seed: int) -> float:
             ids = np.arange(first, min(first + BATCH, count + 1))
             rng = np.random.default_rng([seed, first])
             with store.transaction():
-                store.instances.put(things(ids, side, rng))
+                store.instances.put(objects(ids, side, rng))
                 store.embeddings.put(SPACE, ids.tolist(), features(len(ids), seed, rng))
                 store.relations.replace(
-                    [], [Relation(int(n), "near", int(n) - 1, 0.9, 0.1) for n in ids if n % THINGS != 1]
+                    [], [Relation(int(n), "near", int(n) - 1, 0.9, 0.1) for n in ids if n % OBJECTS != 1]
                 )
     return round(time.perf_counter() - started, 1)
 
 
-def things(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Iterator[Instance]:
+def objects(ids: NDArray[np.int64], side: int, rng: np.random.Generator) -> Iterator[Instance]:
     """Boxes of 5 cm to 2 m, small ones the most, anywhere in their room and turned about the vertical."""
-    room = (ids - 1) // THINGS
+    room = (ids - 1) // OBJECTS
     corner = np.stack([room % side, room // side, np.zeros_like(room)], axis=1) * ROOM_M
     size = 0.05 * 40.0 ** (rng.uniform(size=(len(ids), 3)) ** 2)
     center = corner + rng.uniform(0.0, 1.0, size.shape) * (ROOM_M - np.minimum(size, ROOM_M)) + size / 2
@@ -230,16 +231,16 @@ def _described(edge_m: float, color: str, shape: str) -> str:
 
 
 def camera_in(place: Floats) -> PosedCamera:
-    """A camera that looks along x, level."""
+    """A level camera along x."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], place
     return PosedCamera(pose, (525.0, 525.0, 319.5, 239.5), (480, 640), 1, 1)
 
 
 def features(count: int, seed: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Unit vectors: 2,000 kinds of things, within a kind 32 ways to differ, and noise in all directions.
+    """Unit vectors: 2,000 kinds of objects, within a kind 32 ways to differ, and noise in all directions.
 
-    Two things of one kind have a cosine of about 0.6, two of different kinds of about 0. Shape (count, 256).
+    Two objects of one kind have a cosine of about 0.6, two of different kinds of about 0. Shape (count, 256).
     """
     fixed = np.random.default_rng([seed, 1])
     kinds = fixed.normal(size=(2000, DIMENSION)) / np.sqrt(DIMENSION)
@@ -251,28 +252,28 @@ def features(count: int, seed: int, rng: np.random.Generator) -> NDArray[np.floa
 
 
 def views(stored: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Other views of stored things: cosine about 0.9 to what is stored."""
+    """Other views of stored objects: cosine about 0.9 to the stored features."""
     made = stored + 0.45 * rng.normal(size=stored.shape) / np.sqrt(stored.shape[1])
     return np.asarray(made / np.linalg.norm(made, axis=1, keepdims=True), np.float32)
 
 
 def one_more_chunk(store: Store, n: int, count: int) -> None:
-    """What the store writes when a chunk has changed 30 things of one room and found 5 new ones."""
-    first = 1 + THINGS * (n % max(1, count // THINGS))
-    changed = list(range(first, min(first + THINGS, count)))
+    """The store's writes when a chunk has changed 30 objects of one room and found 5 new ones."""
+    first = 1 + OBJECTS * (n % max(1, count // OBJECTS))
+    changed = list(range(first, min(first + OBJECTS, count)))
     new = [store.ids.next() + k for k in range(5)]
     rng = np.random.default_rng(n)
     side = int(rooms(count)[0] / ROOM_M[0] + 0.5)
     with store.transaction():
-        store.instances.put(things(np.array(changed + new), side, rng))
+        store.instances.put(objects(np.array(changed + new), side, rng))
         store.embeddings.put(SPACE, changed + new, features(len(changed) + 5, 1, rng))
         store.relations.replace(changed, [Relation(a, "near", a - 1, 0.9, 0.1) for a in changed[1:]])
 
 
-# ---------------------------------------------------------------------------------------------- beside it
+# -------------------------------------------------------------------------------------------------- peers
 
 
-def beside(
+def peers(
     store: Store, points: Floats, asked: NDArray[np.float32], found: dict[int, list[int]], *, database: bool
 ) -> dict[str, Any]:
     """A plain NumPy scan over the same data, which is also the truth for the recall, and a vector database."""
@@ -355,8 +356,8 @@ def timed(
     name: str, questions: list[Callable[[], Any]], warm: int = 3, before: Callable[[], None] = lambda: None
 ) -> dict[str, float]:
     """p50 and p99 of single questions, milliseconds by the clock and of processor time, after a few to warm up that are
-    asked once more. The clock counts what else the machine does; the processor's time what the question costs. What
-    comes `before` each is not counted.
+    asked once more. The clock includes other work of the machine; processor time is the cost of the question. `before`
+    is not counted.
     """
     spent = []
     for n, ask in enumerate([*questions[:warm], *questions]):

@@ -1,14 +1,14 @@
-"""The paper's real sequences: build, evaluate, and print its tables for data that lie on your disk.
+"""The paper's real sequences: build, evaluate, and print its tables for data that are on your disk.
 
     python benchmarks/sequences.py tum --root /data/tum --json tum.json
     python benchmarks/sequences.py 7scenes --root /data/7scenes -- --reconstruction pi3 --device cuda
     python benchmarks/sequences.py nrgbd --root /data/nrgbd --list
 
-docs/sequences.md says where each data set comes from and how its folders must lie. What follows `--` goes to
-`list3r build`; without it depth is used where a sequence has it. Scenes that --root does not have are named and left
-out; `--scene` (repeatable) takes other folders under it. ATE is after Sim(3) alignment as in the paper; RTE and RRE are
-the relative errors over --delta, after the same scale. Clouds (ETH3D, NRGBD) are laid on the truth by the camera's
-path. What stands in the JSON already is not done again.
+docs/sequences.md has the source of each data set and the layout of its folders. Options after `--` go to `list3r
+build`; without it depth is used where a sequence has it. Scenes that --root does not have are named and left out;
+`--scene` (repeatable) takes other folders under it. ATE is after Sim(3) alignment as in the paper; RTE and RRE are the
+relative errors over --delta, after the same scale. Clouds (ETH3D, NRGBD) are aligned with the truth by the camera's
+path. Results in the JSON are not repeated.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class DataSet:
     """Sequences of one layout."""
 
     scenes: tuple[str, ...]
-    """Those of the paper's tables, as patterns of folders under the root."""
+    """Scenes of the paper's tables, as patterns of folders under the root."""
     options: tuple[str, ...] = ()
-    """What `build` must be told, because the files do not say it."""
+    """Options that `build` needs because the files lack them."""
     clouds: bool = False
     """Whether the paper compares clouds."""
 
@@ -76,7 +76,7 @@ DATA_SETS = {
     "bonn": DataSet(("rgbd_bonn_*",), ("--intrinsics", "542.822841,542.576870,315.593520,237.756098")),
     "nrgbd": DataSet(("*",), clouds=True),
 }
-"""What the paper's tables name; of BONN and NRGBD it names no list, so all are taken."""
+"""Scenes of the paper's tables; for BONN and NRGBD it has no list, so all are taken."""
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--scene", action="append", help="a folder under --root instead of the paper's")
     parser.add_argument("--frames", help="START:STOP of every sequence")
     parser.add_argument("--delta", default="1", help="of RTE and RRE, as `list3r eval trajectory` takes it")
-    parser.add_argument("--list", action="store_true", help="say what would be done, and do nothing")
+    parser.add_argument("--list", action="store_true", help="print the plan, and do nothing")
     parser.add_argument("--keep", type=Path, help="folder in which memories are kept")
     parser.add_argument("--json", type=Path)
     said = sys.argv[1:]
@@ -148,7 +148,7 @@ def one_scene(root: Path, data: str, folder: Path, options: Sequence[str], delta
 def from_nrgbd(folder: Path, out: Path) -> Path:
     """Return a folder in the layout of nerfstudio with a scene of Neural RGB-D: poses are OpenGL's, depth millimetres.
 
-    Pictures are linked where the disk allows it, else copied. Frames whose pose is not finite have none.
+    Pictures are linked where the disk allows it, else copied. Frames with a pose that is not finite have none.
     """
     if (out / "transforms.json").exists():
         return out

@@ -1,14 +1,14 @@
-"""A simulated home filmed twice, with things moved, removed and added in between; and redkitchen cut in two.
+"""A simulated home filmed twice, with objects moved, removed and added in between; and redkitchen cut in two.
 
 python benchmarks/sessions.py --seeds 1,2,3,4,5 --json benchmarks/results/sessions.json
 
-The second walk goes the other way round and starts elsewhere. Placement: the rigid motion that is left between the
-second session's camera path and the truth when the world is laid on the truth by the first session alone. Ids: of the
-unchanged things that both memories found. Events: moved, removed and added against what was done to the world, over
-the changes of which the camera saw enough (150 px in some frame of each walk that should show it). An event is about
-the thing that its id stands for in the memory before (for added: after), else about the thing within 0.1 m of where it
-says; a move must also end where the thing is. What is said of changes of which the camera saw less counts neither way
-where it is true. The third entry of `missed` says whether the memory held the thing before (or, for added, at all).
+The second walk goes the other way round and starts elsewhere. Placement: the residual rigid motion between the second
+session's camera path and the truth after alignment by the first session alone. Ids: of the unchanged objects that both
+memories found. Events: moved, removed and added against the changes of the world that the camera saw well enough (150
+px in some frame of each walk that should show it). An event is about the object of its id in the memory before (for
+added: after), else about the object within 0.1 m of its place; a move must also end at the object. True events of less
+visible changes are ignored. The third entry of `missed` says whether the memory had the object before (or, for added,
+at all).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from list3r.simulation.walk import camera_path
 MIN_PX = 150
 KINDS = ("moved", "removed", "added")
 ELSEWHERE_M = 0.05
-"""What was carried less far is where it was."""
+"""Objects that were moved less far count as unchanged."""
 
 
 class ReturnWalk(ChangedWalk):
@@ -104,18 +104,18 @@ def one_home(root: Path, seed: int, workers: str, discovery: str = "") -> dict[s
 
 @dataclass(frozen=True)
 class Due:
-    """What a memory could tell of a walk."""
+    """Changes that a memory could report of a walk."""
 
     changes: set[tuple[str, int]]
-    """Kind and thing."""
+    """Kind and object."""
     besides: set[tuple[str, int]]
-    """What counts neither way."""
+    """Ignored changes."""
     scenes: Sequence[dict[str, Any]]
-    """Where things were when they were last seen before, and where they are."""
+    """Where objects were when they were last seen before, and where they are."""
 
     @staticmethod
     def of(scenes: Sequence[dict[str, Any]]) -> Due:
-        """Return what was done between two walks."""
+        """Return the changes between two walks."""
         done = _changes(scenes)
         faint = _changes(scenes, 0) - done
         faint |= {(kind, t) for k, t in faint if k == "moved" for kind in ("removed", "added")}
@@ -124,7 +124,7 @@ class Due:
 
 def measure(before: Store, after: Store, walks: Sequence[Path], due: Due | None = None) -> dict[str, Any]:
     """Placement, ids and events of an updated memory against the truth of the walks in it, before and with the last;
-    the events against what was done since the walk before it, or what was `due`.
+    the events against the changes since the walk before it, or those `due`.
     """
     last = len(walks)
     truth = [read_tum(walk / "groundtruth.txt") for walk in (walks[0], walks[-1])]
@@ -138,28 +138,28 @@ def measure(before: Store, after: Store, walks: Sequence[Path], due: Due | None 
     now = {e: t for t, e, _ in second["matched_ids"]}
     due = due or Due.of(scenes)
     done = due.changes
-    unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {thing for _, thing in done}]
+    unchanged = [(i, t) for i, t in was.items() if t in now.values() and t not in {obj for _, obj in done}]
     kept = sum(now.get(after.ids.resolve(i)) == t for i, t in unchanged)
-    told = {_told(e, was, now, due.scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
-    told -= due.besides
-    wrong = sorted((k, t) for k, t in told - done)
+    claimed = {_report(e, was, now, due.scenes, S_truth_two) for e in after.events.all(last) if e.kind in KINDS}
+    claimed -= due.besides
+    wrong = sorted((k, t) for k, t in claimed - done)
     known = {t for t in was.values()} | {t for k, t in done if k == "added"}
     return {
         "placed_m": round(moved_m, 4),
         "placed_deg": round(turned_deg, 3),
         "unchanged": len(unchanged),
         "ids_kept": kept,
-        "events": {k: _counts(told, done, k) for k in KINDS},
-        "missed": sorted((k, t, t in known) for k, t in done - told),
+        "events": {k: _counts(claimed, done, k) for k in KINDS},
+        "missed": sorted((k, t, t in known) for k, t in done - claimed),
         "false": wrong,
         "false_removed_unseen": sum(k == "removed" and _unseen(scenes[1], t) for k, t in wrong),
-        "first": things_found(first),
-        "last": things_found(second),
+        "first": objects_found(first),
+        "last": objects_found(second),
     }
 
 
-def things_found(found: dict[str, Any]) -> dict[str, Any]:
-    """Things and relations after a session: counts."""
+def objects_found(found: dict[str, Any]) -> dict[str, Any]:
+    """Objects and relations after a session: counts."""
     names = ("true_count", "estimated_count", "matched", "duplicates", "merged_pairs")
     out: dict[str, Any] = {k: {n: found[f"instances_{k}"][n] for n in names} for k in ("0.25", "0.50")}
     for name, entry in found["relations"]["by_predicate"].items():
@@ -168,7 +168,7 @@ def things_found(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _changes(scenes: Sequence[dict[str, Any]], least_px: int = MIN_PX) -> set[tuple[str, int]]:
-    """What was done to things of which the camera saw enough, wherever they stood."""
+    """Changes of objects that the camera saw well enough, anywhere."""
     a, b = ({e["id"]: e for e in s["instances"] if not e["structure"]} for s in scenes)
     seen_a, seen_b = ({k for k, e in s.items() if e["largest_px"] >= least_px} for s in (a, b))
     out = {("removed", k) for k in seen_a - set(b)} | {("added", k) for k in seen_b - set(a)}
@@ -176,8 +176,8 @@ def _changes(scenes: Sequence[dict[str, Any]], least_px: int = MIN_PX) -> set[tu
 
 
 def is_elsewhere(a: dict[str, Any], b: dict[str, Any] | None) -> bool:
-    """Whether a thing of one truth stands elsewhere in another. Where the truth says how far it was `carried`, that
-    decides: boxes of what was seen of a thing lie elsewhere where another side of it was seen.
+    """Whether an object has moved between two truths. The truth's `carried` distance decides where given: the box of
+    the visible part shifts when another side is seen.
     """
     if b is None:
         return True
@@ -187,17 +187,15 @@ def is_elsewhere(a: dict[str, Any], b: dict[str, Any] | None) -> bool:
     return float(np.linalg.norm(np.subtract(*places))) > ELSEWHERE_M
 
 
-def _told(
+def _report(
     event: ChangeEvent,
     was: dict[int, int],
     now: dict[int, int],
     scenes: Sequence[dict[str, Any]],
     S_truth_world: Sim3,
 ) -> tuple[str, int]:
-    """Kind of an event and the true thing that it is about; a number below zero where it is about none.
-
-    The thing is the one that the id stands for, else the one whose middle lies where the event says; what is said to
-    have moved must have gone to where it is.
+    """Kind of an event and its true object; a number below zero for none. The object is that of the id, else the one
+    centred at the event's place; a moved object must be at the event's end.
     """
     places = [
         _there(box, scene, S_truth_world) for box, scene in zip((event.from_box, event.to_box), scenes, strict=True)
@@ -211,21 +209,21 @@ def _told(
 
 
 def _there(box: OrientedBox | None, scene: dict[str, Any], S_truth_world: Sim3, most_m: float = 0.1) -> int | None:
-    """The thing of a scene whose middle lies where a box has its own."""
+    """The object of a scene with the same centre as a box."""
     if box is None:
         return None
     at = S_truth_world.apply(box.center[None])[0]
-    things = [e for e in scene["instances"] if not e["structure"]]
-    off = [float(np.linalg.norm(np.array(e["box"]["center"]) - at)) for e in things]
-    return int(things[int(np.argmin(off))]["id"]) if off and min(off) <= most_m else None
+    objects = [e for e in scene["instances"] if not e["structure"]]
+    off = [float(np.linalg.norm(np.array(e["box"]["center"]) - at)) for e in objects]
+    return int(objects[int(np.argmin(off))]["id"]) if off and min(off) <= most_m else None
 
 
-def _unseen(scene: dict[str, Any], thing: int) -> bool:
-    return any(e["id"] == thing and e["largest_px"] == 0 for e in scene["instances"])
+def _unseen(scene: dict[str, Any], obj: int) -> bool:
+    return any(e["id"] == obj and e["largest_px"] == 0 for e in scene["instances"])
 
 
-def _counts(told: set[tuple[str, int]], done: set[tuple[str, int]], kind: str) -> dict[str, int]:
-    said, true = ({t for k, t in s if k == kind} for s in (told, done))
+def _counts(claimed: set[tuple[str, int]], done: set[tuple[str, int]], kind: str) -> dict[str, int]:
+    said, true = ({t for k, t in s if k == kind} for s in (claimed, done))
     return {"hit": len(said & true), "false": len(said - true), "missed": len(true - said)}
 
 
@@ -246,7 +244,7 @@ def _path(store: Store, session: int) -> Trajectory:
 
 
 def _placement(truth: Trajectory, estimate: Trajectory, S_truth_world: Sim3) -> tuple[float, float]:
-    """Metres at the middle of the path, and degrees, by which the session as a whole lies off."""
+    """Metres at the middle of the path, and degrees, by which the session as a whole is off."""
     rest = alignment_of(truth, estimate, with_scale=False) @ S_truth_world.inverse()
     middle = S_truth_world.apply(np.median(estimate.T_world_cam[:, :3, 3], axis=0)[None])
     turn = np.degrees(np.arccos(np.clip((np.trace(rest.rotation) - 1) / 2, -1, 1)))
@@ -285,8 +283,8 @@ def redkitchen(root: Path, source: Path, workers: str, cut: int = 500) -> dict[s
         again = [k for k in small if k in events and events[k].kind == "seen_again"]
         gone = [k for k in small if store.ids.resolve(k) != k]
     changed = [(e.kind, k) for k, e in events.items() if e.kind in KINDS]
-    small_things = {"small": len(small), "small_seen_again": len(again), "small_aliased": len(gone)}
-    return {**report["events"], "placed": report["placed"], **usage, **small_things, "false": changed}
+    small_objects = {"small": len(small), "small_seen_again": len(again), "small_aliased": len(gone)}
+    return {**report["events"], "placed": report["placed"], **usage, **small_objects, "false": changed}
 
 
 if __name__ == "__main__":

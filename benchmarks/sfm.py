@@ -1,10 +1,10 @@
-"""Colour video without weights: `--reconstruction sfm` beside plain pycolmap of the whole sequence, in one run.
+"""Colour video without weights: `--reconstruction sfm` compared with plain pycolmap of the whole sequence, in one run.
 
     python benchmarks/sfm.py --source ../shared/data/redkitchen --intrinsics 525,525,320,240 --json FILE
 
-Depth and poses of the source are left aside: a folder of its colour pictures alone is built, and the poses serve as
+Depth and poses of the source are not used: a folder of its colour pictures alone is built, and the poses serve as
 truth. Plain pycolmap (SIFT, sequential matching, incremental mapping, its own defaults) maps every n-th of the same
-frames with the same freedom: the focal length held where it is given, the distortion free. Times are wall and CPU
+frames with the same parameters: the focal length fixed where it is given, the distortion free. Times are wall and CPU
 seconds, of the whole program for ours, of features, matching and mapping for the other.
 """
 
@@ -81,7 +81,7 @@ def colour_only(folder: Path, names: list[Path]) -> Path:
 
 
 def _video(folder: Path, scratch: Path, kind: str) -> Path:
-    """The pictures as an mp4; for a phone stored lying on its side with a note to turn them, at an uneven rate."""
+    """The pictures as an mp4; for a phone rotated with a tag to turn them, at an uneven rate."""
     import av
 
     phone = kind == "phone"
@@ -107,7 +107,7 @@ def _video(folder: Path, scratch: Path, kind: str) -> Path:
     first = next(iter(open_source(path).read(0, 1)))
     upright = cv2.imread(str(min(folder.iterdir())))[..., ::-1]
     assert isinstance(first, Frame) and first.color.shape == upright.shape
-    assert np.abs(first.color.astype(int) - upright).mean() < 8, "the clip does not show what was filmed"
+    assert np.abs(first.color.astype(int) - upright).mean() < 8, "the clip does not show the filmed pictures"
     return path
 
 
@@ -118,7 +118,7 @@ def _options(args: argparse.Namespace) -> list[str]:
 
 
 def built(folder: Path, memory: Path, options: list[str], truth: Trajectory) -> dict[str, Any]:
-    """What `list3r build FOLDER --reconstruction sfm` makes of pictures; `truth` at index / 30 s."""
+    """Result of `list3r build FOLDER --reconstruction sfm`; `truth` at index / 30 s."""
     options = ["--reconstruction", "sfm", *options]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     report, usage = run_list3r("build", str(folder), "-m", str(memory), *options)

@@ -1,9 +1,8 @@
-"""Work that several variants of association ask for alike on one video, done once.
+"""Cache of work that several variants of association share on one video.
 
-Every variant measures the same edges, asks for the same joint windows and tests the same relations wherever its
-settings and what it found so far agree. These are functions of their arguments alone, so what one variant computed is
-what the next would; `tests/test_benchmark_shared_work.py` holds both to be equal. Memory files, which live for one
-variant, are not compressed.
+Variants measure the same edges, ask for the same joint windows and test the same relations wherever their settings and
+earlier results agree. These are pure functions, so results can be shared; `tests/test_benchmark_shared_work.py`
+compares both. Memory files, which live for one variant, are not compressed.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class SharedWork:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Let the stages of association take what is known."""
+        """Let the stages of association use the cache."""
         from importlib import import_module
 
         with ExitStack() as stack:

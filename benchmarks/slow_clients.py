@@ -1,11 +1,11 @@
-"""How long `list3r serve` takes to answer a client while others of the same address are slow on purpose.
+"""Latency of `list3r serve` for a client while others of the same address are slow on purpose.
 
     PYTHONPATH=. python benchmarks/slow_clients.py --clients 200 --seconds 60 --json FILE
 
 A fifth of the slow ones each: send nothing; send a byte of their headers a second; the same after a first request that
 was answered; send a byte of a body a second; ask once a second and take no answer. The third and the fifth kind have a
-token. Whichever is cut connects anew at once. The client that is not slow asks over a new connection each time, and
-over one that it keeps as long as the service does.
+token. A closed one reconnects at once. The normal client asks over a new connection each time, and over one that it
+keeps open.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     args = parser.parse_args()
-    told: dict[str, Any] = {"slow_clients": args.clients, "seconds": args.seconds}
+    report: dict[str, Any] = {"slow_clients": args.clients, "seconds": args.seconds}
     with tempfile.TemporaryDirectory() as folder, _service(Path(folder)) as port:
-        told["alone"] = _asked(port, 5.0)
+        report["alone"] = _asked(port, 5.0)
         spawn = multiprocessing.get_context("spawn")
         ready, connected = spawn.Event(), spawn.Value("l", 0)
         slow = spawn.Process(target=_slow, args=(port, args.clients, ready, connected), daemon=True)
         slow.start()
         ready.wait()
-        told["beside_slow_clients"] = _asked(port, args.seconds)
-        told["connections_of_slow_clients"] = connected.value
+        report["beside_slow_clients"] = _asked(port, args.seconds)
+        report["connections_of_slow_clients"] = connected.value
         slow.terminate()
         slow.join()
-    print(told)
+    print(report)
     if args.json is not None:
-        write_json(args.json, told)
+        write_json(args.json, report)
 
 
 @contextlib.contextmanager
@@ -101,7 +101,7 @@ def _asked(port: int, seconds: float) -> dict[str, Any]:
             began = time.monotonic()
             try:
                 status[which][str(_ask(connection))] += 1
-            except (OSError, http.client.HTTPException) as error:  # a kept one connects anew for the next request
+            except (OSError, http.client.HTTPException) as error:  # a kept one reconnects for the next request
                 status[which][type(error).__name__] += 1
                 connection.close()
             took[which].append(time.monotonic() - began)

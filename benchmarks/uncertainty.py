@@ -1,4 +1,4 @@
-"""Whether chunks lie where the memory says they do: the share of true positions inside the stated 95 % region.
+"""Whether chunks are where the memory says: the share of true positions inside the stated 95 % region.
 
     python benchmarks/uncertainty.py --presets kidnap,loop --seeds 1,2 --json FILE
 
@@ -69,7 +69,7 @@ def run_video(job: tuple[str, int]) -> dict[str, Any]:
 
 
 class Truth:
-    """Compares where the chunks of a memory lie, and how sure it is of that, with a simulated video."""
+    """Compares where the chunks of a memory are, and how sure it is of that, with a simulated video."""
 
     def __init__(self, video: Any) -> None:
         self.frames = len(video.time_s)
@@ -106,7 +106,7 @@ class Truth:
         }
 
     def _chunk_from_truth(self, samples: Any) -> Any:
-        """The similarity from the truth to a chunk by all that the chunk saw and that stands still, trimmed."""
+        """The similarity from the truth to a chunk by all that the chunk saw and that is still, trimmed."""
         from list3r.memory.geometry import umeyama
 
         video = self._video
@@ -147,7 +147,7 @@ def _compared(chunk: Any, center: Array, true_center_world: Array) -> dict[str, 
 
 
 def summarise(videos: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Shares over all chunks, by preset and pooled, and the share of videos in which no chunk lies outside."""
+    """Shares over all chunks, by preset and pooled, and the share of videos in which no chunk is outside."""
     out = {}
     for name in [*dict.fromkeys(v["preset"] for v in videos), "all"]:
         mine = [v for v in videos if name in (v["preset"], "all")]

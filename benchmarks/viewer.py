@@ -2,8 +2,8 @@
 
 PYTHONPATH=. python benchmarks/viewer.py --points 5000000 --json FILE --picture FILE
 
-The memory is made up (`exporters.py`). The page is Chromium without a screen and without a graphics card: what draws is
-its software renderer, so a frame is told in processor seconds of all its processes as well.
+The memory is synthetic (`exporters.py`). The page is Chromium without a screen and without a graphics card: its
+software renderer draws, so a frame is also given in processor seconds of all its processes.
 """
 
 from __future__ import annotations
@@ -40,57 +40,57 @@ WebGL2RenderingContext.prototype.clear = function(...words) { window.drew = true
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=5_000_000)
-    parser.add_argument("--things", type=int, default=2_000)
+    parser.add_argument("--objects", type=int, default=2_000)
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     parser.add_argument("--picture", type=Path, help="file for a picture of the page")
     args = parser.parse_args()
     from list3r.viewer.app import Viewer, ViewerSettings
     from tests.browser import Browser
 
-    exporters.POINTS = args.points // args.things
+    exporters.POINTS = args.points // args.objects
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.l3r"
-        exporters.write_memory(path, args.things)
-        told = {"points": args.points, "instances": args.things, "file_mb": round(path.stat().st_size / 1e6, 1)}
+        exporters.write_memory(path, args.objects)
+        report = {"points": args.points, "instances": args.objects, "file_mb": round(path.stat().st_size / 1e6, 1)}
         with list3r.open(path) as memory:
             began = time.process_time()
             viewer = Viewer(memory, ViewerSettings(0))
-            told["start_cpu_s"] = round(time.process_time() - began, 1)
-            told["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+            report["start_cpu_s"] = round(time.process_time() - began, 1)
+            report["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
             page = Browser(Path(folder) / "profile")
             try:
-                told |= measure(page, viewer, args.picture)
+                report |= measure(page, viewer, args.picture)
             finally:
                 page.close()
                 viewer.stop()
-    print(told)
-    write_json(args.json, told)
+    print(report)
+    write_json(args.json, report)
 
 
 def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, Any]:
-    """What the page takes to load, to turn and to search."""
+    """Time of the page to load, to turn and to search."""
     began = time.monotonic()
     page.open(viewer.address)
-    page.wait(lambda: "Click a thing, or search for one." in page.text(), 300)
+    page.wait(lambda: "Click an object, or search for one." in page.text(), 300)
     page.wait(viewer.server.get_clients, 300)
     loaded = time.monotonic() - began
-    page.wait(lambda: [p for p in viewer._pages.values() if p.settled], 300)
+    page.wait(lambda: [p for p in viewer._pages.values() if p.at_rest], 300)
     (points,) = viewer._pages.values()
-    told = {"load_s": round(loaded, 1), "shown_s": round(time.monotonic() - began, 1)}
-    told |= {"page_draws_points_a_s": round(1 / (points.seconds_a_point or 1e-9)), "at_rest": drawn(points, "/fine/")}
+    report = {"load_s": round(loaded, 1), "shown_s": round(time.monotonic() - began, 1)}
+    report |= {"page_draws_points_a_s": round(1 / (points.seconds_a_point or 1e-9)), "at_rest": drawn(points, "/fine/")}
     page.run(f"window.drawn = []; {COUNT_FRAMES}")
-    told |= {"moving": drawn(points, "/coarse/"), **turn(page)}
-    print(told, flush=True)
+    report |= {"moving": drawn(points, "/coarse/"), **turn(page)}
+    print(report, flush=True)
     time.sleep(5.0)
     began = time.monotonic()
     page.fill("Find", "Stuhl")
     page.press("Search")
     page.wait(lambda: viewer.state.selected is not None, 300)
-    told["search_s"] = round(time.monotonic() - began, 2)
+    report["search_s"] = round(time.monotonic() - began, 2)
     time.sleep(5.0)
     if picture is not None:
         Image.fromarray(page.picture()).save(picture)
-    return {**told, "console_errors": page.errors}
+    return {**report, "console_errors": page.errors}
 
 
 def drawn(points: PageClouds, level: str) -> int:
@@ -99,7 +99,7 @@ def drawn(points: PageClouds, level: str) -> int:
 
 
 def turn(page: Browser) -> dict[str, float]:
-    """Turn the camera with the mouse; frames a second, the longest wait for one and what a frame costs."""
+    """Turn the camera with the mouse; frames a second, the longest wait for one and the cost of a frame."""
     page.run("window.drawn = []")
     used, began, step = cpu_seconds(page), time.monotonic(), 0
     page.call("Input.dispatchMouseEvent", type="mousePressed", x=400, y=400, button="left", clickCount=1)

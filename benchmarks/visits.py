@@ -34,21 +34,21 @@ from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.worlds.world import SimulatedWorld
 
 DONE = {"moved": 2, "removed": 1, "added": 1}
-"""What is done to the home as it first was, before each visit but the first."""
+"""Changes of the initial home, before each visit but the first."""
 
 
 @dataclass(frozen=True)
 class VisitWalk(ChangedWalk):
-    """The same rooms at another visit: what was added for it is at no other."""
+    """The same rooms at another visit: its added objects are at no other."""
 
     visit: int = 1
 
     def world(self) -> SimulatedWorld:
         """The world of the visit."""
-        known = {t.id for t in WalkSettings(seed=self.seed).world().things}
+        known = {t.id for t in WalkSettings(seed=self.seed).world().objects}
         world = super().world()
-        added = (replace(t, id=t.id if t.id in known else 100 * self.visit + t.id) for t in world.things)
-        return replace(world, things=tuple(added))
+        added = (replace(t, id=t.id if t.id in known else 100 * self.visit + t.id) for t in world.objects)
+        return replace(world, objects=tuple(added))
 
 
 class BackWalk(VisitWalk, ReturnWalk):

@@ -1,4 +1,4 @@
-"""Colour walks in wide steps, as phones' exports of 2 to 4 frames a second are: ours beside plain pycolmap.
+"""Colour walks in wide steps, as in phones' exports of 2 to 4 frames a second: ours compared with plain pycolmap.
 
     python benchmarks/colour.py --step 0.08 --seeds 31,32,33,34,35 --real ../shared/data/redkitchen --json FILE
 
@@ -6,8 +6,8 @@ Each simulated walk goes to and fro between two rooms and films them from a new 
 each step: 8 cm or 4 degrees, whichever comes first (`--hard`: 6 degrees, and the camera touches door frames, as in
 research/colour-video 0074). The real one is every eighth frame of a folder with poses. Both programs get the same
 pictures and focal length (plain pycolmap: `benchmarks/sfm.py`). `cpu_s_a_frame` is that of all processes of the
-program; with two idle cores a frame takes half of it or little more. In `--keep` what each program made of a walk is
-noted, ours by its commit, and not made again.
+program; with two idle cores a frame takes half of it or little more. In `--keep` each program's result of a walk is
+cached, ours by its commit.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ def compare_walks(args: argparse.Namespace) -> None:
             )
             folder = root / f"{'hard' if args.hard else 'wide'}-{seed}-{args.frames}"
             rows.append({"walk": f"seed {seed}", **_simulated(folder, walk, args)})
-            _tell(rows, args)
+            _report(rows, args)
         if args.real is not None:
             rows.append({"walk": f"{args.real.name}, every {REAL_EVERY}th", **_real(root / "wide-real", args)})
-            _tell(rows, args)
+            _report(rows, args)
     print(machine())
 
 
-def _tell(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
+def _report(rows: list[dict[str, Any]], args: argparse.Namespace) -> None:
     print("  ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
     said = {"step_m": args.step, "hard": args.hard, "frames": args.frames, "size": SIZE}
     write_json(args.json, {**said, "walks": rows})
@@ -98,7 +98,7 @@ def _compared(
 
 
 def _noted(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return what a file holds, or what is made and then written there."""
+    """Return the content of a file, or make and write it."""
     if not path.exists():
         path.write_text(json.dumps(make()))
     return dict(json.loads(path.read_text()))

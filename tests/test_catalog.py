@@ -21,7 +21,14 @@ from list3r.catalog import Catalog
 from list3r.catalog.backends import open_backend
 from list3r.catalog.catalog import box_distances
 from list3r.catalog.reading import read_content
-from list3r.catalog.records import CatalogError, CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
+from list3r.catalog.records import (
+    CatalogError,
+    CatalogFilters,
+    CatalogInstance,
+    MemoryContent,
+    MemoryEntry,
+    SpaceVectors,
+)
 from list3r.cli.app import run as list3r
 from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import List3rError, OptionError, SpaceMismatchError, UnknownIdError
@@ -64,26 +71,26 @@ def catalog(url: str) -> Iterator[Catalog]:
 def content(name: str, count: int = 120, seed: int = 1) -> MemoryContent:
     """A memory of boxes that stand askew, with names, relations and vectors."""
     chance = np.random.default_rng(seed)
-    things = []
+    instances = []
     for n in range(count):
         box = OrientedBox(chance.uniform(0, 4, 3), chance.uniform(0.1, 1.0, 3), rotation_exp(chance.normal(size=3)))
         label, structure = ("mug", "box", "lamp")[n % 3], "floor" if n % 10 == 9 else None
         state = "removed" if n % 7 == 6 else "present"
         told = (label, f"red {label}", state, structure, float(n % 5) / 5 + 0.1, 0.01, 1, box)
         words = {word: round(100 * fits) for word, fits in vocabulary(label, None, f"red {label}", "dark red").items()}
-        things.append(CatalogThing(name, n, *told, words))
+        instances.append(CatalogInstance(name, n, *told, words))
     relations = [(n, "on", n + 1, 0.9, 0.1) for n in range(0, count - 1, 2)]
     vectors = chance.normal(size=(count, 16)).astype(np.float32)
     entry = MemoryEntry(name, f"/none/{name}.l3r", 0, f"{name}{seed}", 9, 0, "relative", "known", count, 1)
-    return MemoryContent(entry, things, relations, [SpaceVectors(SPACE, np.arange(count), vectors)])
+    return MemoryContent(entry, instances, relations, [SpaceVectors(SPACE, np.arange(count), vectors)])
 
 
-def box_distance(thing: CatalogThing, point: np.ndarray[Any, Any]) -> float:
-    return float(box_distances([thing], point)[0])
+def box_distance(instance: CatalogInstance, point: np.ndarray[Any, Any]) -> float:
+    return float(box_distances([instance], point)[0])
 
 
-def passing(filters: CatalogFilters) -> list[CatalogThing]:
-    wanted = content("random").things
+def passing(filters: CatalogFilters) -> list[CatalogInstance]:
+    wanted = content("random").instances
     wanted = [t for t in wanted if t.confidence >= filters.min_confidence and (filters.structure or not t.structure)]
     return [t for t in wanted if filters.state == "any" or t.state == (filters.state or "present")]
 
@@ -365,12 +372,12 @@ def test_what_is_asked_is_never_part_of_a_statement(catalog: Catalog, text: str)
 def test_names_of_things_are_kept_as_they_are(url: str, catalog: Catalog) -> None:
     """Labels, descriptions and names of memories of all kinds go in and come out."""
     held, labels = content("strange", count=len(STRANGE)), [text.replace("\x00", "\ufffd") for text in STRANGE]
-    things = [replace(t, label=label, structure=None) for t, label in zip(held.things, labels, strict=True)]
+    instances = [replace(t, label=label, structure=None) for t, label in zip(held.instances, labels, strict=True)]
     backend = open_backend(url)
     name = "m'); DELETE FROM memory; --"
-    backend.put(replace(held, entry=replace(held.entry, name=name), things=things))
+    backend.put(replace(held, entry=replace(held.entry, name=name), instances=instances))
     found = catalog.nearest(name, point=(0, 0, 0), k=9, filters=CatalogFilters(state="any"))
-    assert {m.label for m in found} == {t.label for t in things}
+    assert {m.label for m in found} == {t.label for t in instances}
     assert {e.name for e in catalog.memories()} >= {name, "random", "other"}
     assert backend.drop(name)
     backend.close()
@@ -570,13 +577,13 @@ def test_a_lost_network_is_told_and_nothing_is_half_written(server: PostgresServ
         before = catalog.find("mug", "far", k=50), catalog.memories()
         held = content("half")
 
-        def things() -> Iterator[CatalogThing]:
-            yield from held.things[:60]
+        def instances() -> Iterator[CatalogInstance]:
+            yield from held.instances[:60]
             network.cut()
-            yield from held.things[60:]
+            yield from held.instances[60:]
 
         with pytest.raises(CatalogError, match="cannot be written; running the same command again is safe") as told:
-            backend.put(replace(held, things=things()))  # type: ignore[arg-type]
+            backend.put(replace(held, instances=instances()))  # type: ignore[arg-type]
         assert "\n" not in str(told.value)
         with pytest.raises(CatalogError, match="cannot be asked") as told:
             catalog.find("mug", "far")

@@ -202,7 +202,7 @@ def test_a_memory_in_two_parts_says_what_is_left_out(place: Path, tmp_path: Path
 def test_cloud_of_a_memory_against_its_own_export_is_perfect(place: Path, tmp_path: Path) -> None:
     errors = ask("eval", "cloud", place / "room.ply", place / "room.l3r", "--plot", tmp_path / "a.svg")
     assert (errors["chamfer_cm"], errors["f_score"]) == (pytest.approx(0, abs=0.01), 1.0)
-    assert "4 things and 2 surfaces" in errors["estimate"]
+    assert "4 instances and 2 surfaces" in errors["estimate"]
     words = ("--align", str(place / "walk.txt"), "--path", str(place / "walk.txt"), "--voxel", "0")
     errors = ask("eval", "cloud", place / "room.ply", place / "room.ply", *words)
     assert errors["chamfer_cm"] < 1e-4
@@ -234,7 +234,7 @@ def test_instances_with_ids_over_time_and_a_picture(place: Path, tmp_path: Path)
     assert scores["instances_0.50"]["recall"] == 1.0
     assert (scores["identities"]["frames"], scores["identities"]["objects"]) == (20, 2)
     assert scores["identities"]["switches"] == 0
-    assert "0 id switches of 2 things in 20 frames" in read(*words)
+    assert "0 id switches of 2 objects in 20 frames" in read(*words)
     assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
     assert ask("eval", "instances", folder / "truth.json", place / "room.json")["identities"] is None
 

@@ -8,9 +8,9 @@ import pytest
 from list3r.instances.geometric.cloud import Cloud
 from list3r.instances.geometric.planes import find_planes
 from list3r.instances.learned.cut import CloudCut
-from list3r.instances.learned.depth_errors import DepthErrorSettings, rim_steps, without_bends, without_slivers
+from list3r.instances.learned.depth_errors import DepthErrorSettings, rim_steps, without_depth_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings
-from list3r.instances.learned.things import ThingVerdicts
+from list3r.instances.learned.verdicts import SegmentVerdicts
 
 HEIGHT, WIDTH, VOXEL = 60, 90, 0.02
 PATCH = (slice(20, 40), slice(30, 60))
@@ -34,7 +34,7 @@ def wall(bend_m: float, tone: float) -> tuple[ChunkSurface, CloudCut]:
     around = Surroundings(np.array([0.0, -1.0, 0.0]), 1.0, 0.0, True)
     none = np.zeros(0, np.int64)
     surface = ChunkSurface(cloud, (), around, (none, none), lab.reshape(-1, 3), (lab,))
-    told = ThingVerdicts(np.float32([0.99, 0.01]), np.float32([0.1, 0.9]), np.ones((2, 1), np.float32))
+    told = SegmentVerdicts(np.float32([0.99, 0.01]), np.float32([0.1, 0.9]), np.ones((2, 1), np.float32))
     return surface, CloudCut(labels.ravel(), told)
 
 
@@ -43,7 +43,7 @@ def test_a_bent_patch_without_a_border_is_wall(bend_m: float, tone: float, thing
     surface, cut = wall(bend_m, tone)
     planes = [p for p in find_planes(surface.cloud, 0.2, 1.0) if len(p.members) > 2000]
     doubt = np.full(len(cut.labels), 0.05, np.float32)
-    left = without_bends(surface, cut, planes, doubt, DepthErrorSettings())
+    left = without_depth_bends(surface, cut, planes, doubt, DepthErrorSettings())
     assert len(left.verdicts.structure) == things and (left.labels >= 0).all()
 
 

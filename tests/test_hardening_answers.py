@@ -53,14 +53,14 @@ def test_a_damaged_memory_answers_as_a_sound_one_or_refuses_every_time(damage: s
     refused = 0
     for name, ask in QUESTIONS.items():
         with list3r.open(path) as scene:
-            told = []
+            message = []
             for _ in range(4):
                 try:
-                    told.append(answer(scene, ask))
+                    message.append(answer(scene, ask))
                 except MemoryFileError as error:
                     assert "repair" in str(error)
                     refused += 1
-        assert set(told) <= {sound[name]} and len(told) in (0, 4), name
+        assert set(message) <= {sound[name]} and len(message) in (0, 4), name
     assert refused >= 4
 
 

@@ -209,9 +209,9 @@ def test_what_a_reader_kept_in_the_log_is_told_and_folded_in(
         writer.close()
     copy.parent.mkdir()
     shutil.copy(path, copy)
-    for command, memory, told in (("verify", path, "-wal"), ("info", path, "-wal"), ("verify", copy, "missing")):
+    for command, memory, message in (("verify", path, "-wal"), ("info", path, "-wal"), ("verify", copy, "missing")):
         assert run([command, str(memory)]) == 0
-        assert told in capsys.readouterr().out
+        assert message in capsys.readouterr().out
     assert run(["repair", str(path)]) == 0
     assert not Path(f"{path}-wal").exists()
     with Store.open(path) as store:

@@ -219,10 +219,10 @@ def test_too_little_address_space_is_one_line(
 
     command = [sys.executable, "-m", "list3r", *words]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    told = subprocess.run(
+    message = subprocess.run(
         command, capture_output=True, text=True, check=False, preexec_fn=limit, cwd=tmp_path, env=environment
     )
-    assert told.returncode == 2 and told.stderr.count("\n") == 1 and "limited to 600 MiB" in told.stderr
+    assert message.returncode == 2 and message.stderr.count("\n") == 1 and "limited to 600 MiB" in message.stderr
 
 
 def test_times_that_stand_still_are_noted(tmp_path: Path) -> None:
@@ -300,8 +300,8 @@ def test_bombs_take_no_memory(tmp_path: Path) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
 
-    told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, preexec_fn=limit)
-    assert told.returncode == 2 and "megapixels" in told.stderr, told.stderr
+    message = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, preexec_fn=limit)
+    assert message.returncode == 2 and "megapixels" in message.stderr, message.stderr
 
 
 @given(st.text("ab\r\né", max_size=60), st.booleans())

@@ -58,8 +58,8 @@ def test_no_text_of_a_memory_reaches_the_terminal_raw(
     path = evil_memory(tmp_path / "evil\x1b[31m\nname.l3r")
     place = 2 if command[0] == "query" else 1
     run([*command[:place], str(path), *command[place:]])
-    told = capsys.readouterr()
-    for text in (told.out, told.err):
+    message = capsys.readouterr()
+    for text in (message.out, message.err):
         assert all(line.isprintable() for line in text.split("\n")), repr(text)
         assert not any(line.strip().startswith("9  forged") for line in text.split("\n"))
 
@@ -89,8 +89,8 @@ def test_letters_that_the_terminal_lacks_are_escaped(make_memory: Make) -> None:
     assert run(["label", str(path), "2", "Café"]) == 0
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     for command in (["list", path], ["query", "find", path, "Café"]):
-        told = program(*command, env=environment, capture_output=True)
-        assert told.returncode == 0 and "Caf\\xe9" in told.stdout, told.stderr
+        message = program(*command, env=environment, capture_output=True)
+        assert message.returncode == 0 and "Caf\\xe9" in message.stdout, message.stderr
 
 
 def test_a_path_that_is_no_text_is_refused_in_one_line(make_memory: Make, tmp_path: Path) -> None:
@@ -116,11 +116,11 @@ def test_output_that_cannot_be_written_is_said_where_it_can(stream: str, state: 
     descriptor = 1 if stream == "stdout" else 2
     where = f"{descriptor}>&-" if state == "closed" else f"{descriptor}>/dev/full"
     command = f"{sys.executable} -m list3r label {path} 2 mug {where}"
-    told = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
-    assert "Traceback" not in told.stderr and "Exception" not in told.stderr
-    assert told.returncode == (1 if (stream, state) == ("stdout", "full") else 0)
-    if told.returncode:
-        assert "cannot be written" in told.stderr and "is done" in told.stderr
+    message = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
+    assert "Traceback" not in message.stderr and "Exception" not in message.stderr
+    assert message.returncode == (1 if (stream, state) == ("stdout", "full") else 0)
+    if message.returncode:
+        assert "cannot be written" in message.stderr and "is done" in message.stderr
     with Store.open(path) as store:
         assert store.instances.get(2).label == "mug"
 
@@ -136,8 +136,8 @@ def test_blanks_within_a_name_make_no_column(make_memory: Make, capsys: pytest.C
 def test_a_server_without_standard_input_ends(make_memory: Make) -> None:
     pytest.importorskip("mcp")
     command = f"{sys.executable} -m list3r mcp {make_memory()} <&-"
-    told = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
-    assert (told.returncode, told.stdout, told.stderr) == (0, "", "")
+    message = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
+    assert (message.returncode, message.stdout, message.stderr) == (0, "", "")
 
 
 def test_clocks_a_day_from_greenwich_are_clocks(make_memory: Make) -> None:
@@ -145,8 +145,8 @@ def test_clocks_a_day_from_greenwich_are_clocks(make_memory: Make) -> None:
     path = make_memory()
     environment = {**os.environ, "TZ": "<+24>-24"}
     for command in (["label", path, "2", "desk"], ["info", path], ["merges", path], ["query", "seen", path, "2"]):
-        told = program(*command, env=environment, capture_output=True)
-        assert (told.returncode, told.stderr) == (0, "")
+        message = program(*command, env=environment, capture_output=True)
+        assert (message.returncode, message.stderr) == (0, "")
 
 
 def test_links_that_lead_to_themselves_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

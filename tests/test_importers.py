@@ -26,12 +26,10 @@ TABLE, CUP = ((1.0, 2.0, 0.36), (1.2, 0.8, 0.72)), ((1.1, 2.1, 0.77), (0.08, 0.0
 
 
 def conceptgraphs(root: Path) -> Path:
-    def thing(number: int, tag: str, box: Any) -> dict[str, Any]:
+    def obj(number: int, tag: str, box: Any) -> dict[str, Any]:
         return {"id": number, "object_tag": tag, "object_caption": "", "bbox_center": box[0], "bbox_extent": box[1]}
 
-    put(
-        root / "obj_json_run.json", json.dumps({"object_1": thing(7, "table", TABLE), "object_2": thing(9, "cup", CUP)})
-    )
+    put(root / "obj_json_run.json", json.dumps({"object_1": obj(7, "table", TABLE), "object_2": obj(9, "cup", CUP)}))
     return root
 
 
@@ -113,9 +111,9 @@ def test_a_cloud_with_numbers_is_a_map_of_things(tmp_path: Path) -> None:
     for binary in (True, False):
         put(tmp_path / "cloud.ply", ply(both, binary))
         found = read_map(tmp_path / "cloud.ply")
-        assert [t.name for t in found.things] == ["4", "6"]
-        assert np.allclose(np.ptp(found.things[0].points, axis=0), TABLE[1], atol=0.01)
-        rgb = found.things[0].rgb
+        assert [t.name for t in found.objects] == ["4", "6"]
+        assert np.allclose(np.ptp(found.objects[0].points, axis=0), TABLE[1], atol=0.01)
+        rgb = found.objects[0].rgb
         assert rgb is not None and rgb[0].tolist() == [200, 30, 30]
 
 
@@ -136,13 +134,13 @@ def test_points_of_colmap_belong_to_what_their_pictures_say(tmp_path: Path) -> N
     for n in (1, 2):
         put(tmp_path / f"masks/{n}.png", bytes(cv2.imencode(".png", mask)[1]))
     found = read_map(tmp_path)
-    assert not found.metric and [t.name for t in found.things] == ["5"]
-    assert len(found.things[0].points) == 12 and found.things[0].points[:, 0].min() == pytest.approx(0.13)
+    assert not found.metric and [t.name for t in found.objects] == ["5"]
+    assert len(found.objects[0].points) == 12 and found.objects[0].points[:, 0].min() == pytest.approx(0.13)
 
 
 def test_older_boxes_and_names_of_spark_dsg_are_read(tmp_path: Path) -> None:
     old, new = read_map(hydra(tmp_path / "a", old=True)), read_map(hydra(tmp_path / "b"))
-    assert np.allclose(old.things[0].points, new.things[0].points)
+    assert np.allclose(old.objects[0].points, new.objects[0].points)
     assert any("not objects" in note for note in new.notes)
     assert (symbol((ord("p") << 56) + 12), symbol(5), symbol("x")) == ("p(12)", "5", "x")
 
@@ -159,7 +157,7 @@ def test_older_boxes_and_names_of_spark_dsg_are_read(tmp_path: Path) -> None:
             "ends",
         ),
         ("cloud.ply", b"PLY", "not a PLY"),
-        ("dsg.json", b'{"nodes": [], "layer_ids": []}', "holds no things"),
+        ("dsg.json", b'{"nodes": [], "layer_ids": []}', "holds no objects"),
         ("other.json", b'{"a": 1}', "not a map of"),
     ],
 )
@@ -196,9 +194,9 @@ def test_a_map_whose_things_stand_along_another_axis_is_told() -> None:
     boxes = [(np.array([0.5 * k, 1.0, 0.35]), np.array([0.4, 0.8, 0.7])) for k in range(5)]
     boxes += [(np.array([0.5 * k, 1.0, 0.75]), np.array([0.1, 0.1, 0.1])) for k in range(5)]
     for axis in ("z", "y", "-x"):
-        things = [(points(box) @ upright(axis)).astype(np.float32) for box in boxes]
-        assert up_axis_notes(things, axis) == ()
-        (told,) = up_axis_notes(things, "z" if axis != "z" else "y")
+        objects = [(points(box) @ upright(axis)).astype(np.float32) for box in boxes]
+        assert up_axis_notes(objects, axis) == ()
+        (told,) = up_axis_notes(objects, "z" if axis != "z" else "y")
         assert f"--up {axis}" in told
 
 

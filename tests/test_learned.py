@@ -24,7 +24,7 @@ from list3r.instances.learned.graph import EDGE_FEATURES, NODE_FEATURES, PieceGr
 from list3r.instances.learned.kernels import seen_across
 from list3r.instances.learned.network import Classification, classify
 from list3r.instances.learned.pieces import cut_pieces
-from list3r.instances.learned.things import ThingVerdicts, classify_things, names_of, thing_features
+from list3r.instances.learned.verdicts import SegmentVerdicts, classify_segments, names_of, segment_features
 from list3r.instances.learned.weights import COMPUTED, FORMAT, SHIPPED, load_weights
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings, SegmentSettings
@@ -141,15 +141,15 @@ def test_verdicts_on_things_are_probabilities_whatever_the_order_of_things() -> 
     hidden = rng.normal(size=(count, len(weights["coarse.node_head.weight"][0]))).astype(np.float32)
     told = Classification(rng.normal(size=len(graph.left)), rng.normal(size=count), log_names, hidden)
     own = rng.integers(5, size=count)
-    said = classify_things(weights, own, graph, told)
+    said = classify_segments(weights, own, graph, told)
     assert (
         said.names.shape == (5, len(names)) and (said.names >= 0).all() and (said.names.sum(axis=1) <= 1 + 1e-5).all()
     )
     assert ((said.whole > 0) & (said.whole < 1)).all() and ((said.structure >= 0) & (said.structure <= 1)).all()
-    turned = classify_things(weights, 4 - own, graph, told)
+    turned = classify_segments(weights, 4 - own, graph, told)
     assert np.allclose(turned.whole[::-1], said.whole, atol=1e-5)
     assert np.allclose(turned.names[::-1], said.names, atol=1e-4)
-    assert thing_features(own, graph, told)[1].shape[1] == len(weights["things.mean"])
+    assert segment_features(own, graph, told)[1].shape[1] == len(weights["things.mean"])
 
 
 def test_it_is_asked_for_by_name() -> None:
@@ -260,7 +260,7 @@ def test_walls_round_a_corner_are_two() -> None:
     cloud = cloud_of(points.astype(np.float32), normals.astype(np.float32))
     count = len(cloud.keys)
     one = np.ones(1, np.float32)
-    cut = CloudCut(np.zeros(count, np.int32), ThingVerdicts(one, one, one[:, None]))
+    cut = CloudCut(np.zeros(count, np.int32), SegmentVerdicts(one, one, one[:, None]))
     parted = _walls_apart(cloud, cut, find_planes(cloud, 0.03, 1.0))
     assert len(parted.verdicts.structure) == len(parted.verdicts.whole) == 2
     first = cloud.points[:, 1] < cloud.points[:, 0]
@@ -273,7 +273,7 @@ def test_both_sides_of_a_thin_wall_are_one() -> None:
     points = np.column_stack([grid[:, 0], np.zeros(len(grid)) + 0.005, grid[:, 1]]).astype(np.float32)
     cloud = cloud_of(points, np.tile(np.array([0, 1, 0], np.float32), (len(grid), 1)))
     one = np.ones(1, np.float32)
-    cut = CloudCut(np.zeros(len(cloud.keys), np.int32), ThingVerdicts(one, one, one[:, None]))
+    cut = CloudCut(np.zeros(len(cloud.keys), np.int32), SegmentVerdicts(one, one, one[:, None]))
     (plane,) = find_planes(cloud, 0.03, 1.0)
     parted = _walls_apart(cloud, cut, [plane, replace(plane, equation=-plane.equation)])
     assert len(parted.verdicts.structure) == 1 and set(parted.labels.tolist()) == {0}

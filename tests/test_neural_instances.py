@@ -19,9 +19,9 @@ from list3r.instances.neural.appearance import Appearance, WithAppearance, label
 from list3r.instances.neural.candidates import SoftMasks, bounds_the_room, choose_candidates
 from list3r.instances.neural.query_segmenter import QuerySegmenter
 from list3r.instances.neural.sam_masks import SamMasks
-from list3r.instances.registry import check_choice, make_discoverer, make_frame_look, make_tracker
+from list3r.instances.registry import check_choice, make_discoverer, make_frame_descriptor, make_tracker
 from list3r.instances.settings import CandidateSettings, InstanceSettings, SamMaskSettings, VideoTrackerSettings
-from list3r.instances.tracking.video_tracker import VideoTracker, _Things
+from list3r.instances.tracking.video_tracker import VideoTracker, _Objects
 from list3r.memory.errors import OptionError
 from list3r.memory.records import LocalLibrary
 from list3r.models import pretrained
@@ -62,9 +62,8 @@ def test_segmenter_proposes_disjoint_named_masks(model: str, checkpoints: dict[s
 @pytest.mark.parametrize("model", ["sam2", "sam3"])
 def test_point_grid_finds_masks(model: str, checkpoints: dict[str, Path], chunk) -> None:
     frames, _ = chunk
-    masks = SamMasks(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(sam=SAM_ALL)).look(
-        frames[3].color
-    )
+    discoverer = SamMasks(model, checkpoints[f"discovery/{model}"], "cpu", InstanceSettings(sam=SAM_ALL))
+    masks = discoverer.segment(frames[3].color)
     assert masks.probability.shape[1:] == frames[3].color.shape[:2]
     assert len(masks.score) == len(masks.features) == len(masks.probability)
     assert (np.diff(masks.score) <= 0).all()
@@ -99,13 +98,15 @@ def test_every_network_runs_in_half_precision(
         made = list(Appearance(model, checkpoints[name], "cpu").tokens(color))
     elif part == "discovery":
         maker = SamMasks if model.startswith("sam") else QuerySegmenter
-        found = maker(model, checkpoints[name], "cpu", InstanceSettings(candidates=EVERYTHING, sam=SAM_ALL)).look(color)
+        found = maker(model, checkpoints[name], "cpu", InstanceSettings(candidates=EVERYTHING, sam=SAM_ALL)).segment(
+            color
+        )
         assert len(found.score) > 0
         made = [found.probability, found.score, found.features]
     else:
         tracker = VideoTracker(model, checkpoints[name], "cpu", InstanceSettings(anchor_step=5))
         proposals = [LearnedDiscoverer(tracker._settings)(frames, reconstruction, p) for p in (0, 5)]
-        things = _Things(proposals, chunk_views(frames, reconstruction, tracker._settings), tracker._tracker)
+        things = _Objects(proposals, chunk_views(frames, reconstruction, tracker._settings), tracker._tracker)
         swept = tracker._sweep(frames, range(2), things, forwards=True)  # a CPU takes long over bfloat16
         made = [logits for _, masks in swept for logits in masks.values()]
         assert len(made) >= 2
@@ -175,8 +176,8 @@ def test_a_frame_is_described_by_its_class_token_and_its_pooled_tokens(
 ) -> None:
     frames, reconstruction = chunk
     folders = ((f"features/{model}", str(checkpoints[f"features/{model}"])),)
-    look = make_frame_look(model, folders, "cpu")
-    assert look is not None and make_frame_look("geometric", (), "cpu") is None
+    look = make_frame_descriptor(model, folders, "cpu")
+    assert look is not None and make_frame_descriptor("geometric", (), "cpu") is None
     found = look(frames[0].color)
     token, patches = Appearance(model, checkpoints[f"features/{model}"], "cpu").tokens(frames[0].color)
     flat = patches.reshape(-1, 32).astype(float)
@@ -294,7 +295,7 @@ def test_names_of_what_bounds_a_room() -> None:
     assert not any(bounds_the_room(n) for n in ("wallet", "cup", "dining table", "rug-merged"))
 
 
-def _things(reconstruction, positions: list[int], labels: np.ndarray, most_live: int = 60) -> _Things:
+def _things(reconstruction, positions: list[int], labels: np.ndarray, most_live: int = 60) -> _Objects:
     frames, _ = walk(SCENE, 10)
     views = chunk_views(frames, reconstruction, InstanceSettings())
     count = int(labels.max())
@@ -304,7 +305,7 @@ def _things(reconstruction, positions: list[int], labels: np.ndarray, most_live:
         )
         for p in positions
     ]
-    return _Things(proposals, views, VideoTrackerSettings(most_live=most_live))
+    return _Objects(proposals, views, VideoTrackerSettings(most_live=most_live))
 
 
 def test_ids_are_handed_over_by_overlap(chunk) -> None:

@@ -94,7 +94,7 @@ def test_too_few_tokens_are_refused_with_how_many_it_takes(many: SceneMemory) ->
 def test_rows_say_where_how_large_and_on_what(memory: SceneMemory) -> None:
     text = memory.prompt(1000).text
     assert "3 mug | 180,10,77 | 8x8x10 | on 2" in text
-    assert "Lengths: cm. z is up." in text and "# room.l3r: 4 things, 2 of structure" in text
+    assert "Lengths: cm. z is up." in text and "# room.l3r: 4 objects, 2 of structure" in text
     assert "Next to: 5 2" in text
 
 
@@ -118,8 +118,8 @@ def test_a_question_brings_what_it_names_to_the_front(many: SceneMemory) -> None
     assert by_id[0] == 157 and set(by_id[1:5]) <= {156, 158, 137, 177}
     unknown = many.prompt(200, "zebras")
     assert unknown.listed == many.prompt(200).listed[: len(unknown.listed)]
-    assert "no thing is known as 'zebra'" in unknown.text
-    assert "no thing is known" not in many.prompt(200, "which lamp is the nearest?").text
+    assert "no instance is known as 'zebra'" in unknown.text
+    assert "no instance is known" not in many.prompt(200, "which lamp is the nearest?").text
 
 
 def test_a_memory_without_scale_or_up_says_so(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_memory_without_scale_or_up_says_so(tmp_path: Path) -> None:
 def test_an_empty_memory_has_a_text_and_a_pack(tmp_path: Path) -> None:
     Store.create(tmp_path / "m.l3r").close()
     with list3r.open(tmp_path / "m.l3r") as opened:
-        assert "0 things" in str(opened.prompt())
+        assert "0 objects" in str(opened.prompt())
         assert {p.name for p in opened.export("prompt", tmp_path / "pack")} >= {"scene.md", "map.png"}
 
 
@@ -162,7 +162,7 @@ def test_a_name_makes_no_row_column_or_entry(tmp_path: Path) -> None:
     assert not [line for line in text.splitlines() if line.startswith("7 gold")]
     (counts,) = (line for line in short.splitlines() if line.startswith("In all:"))
     assert counts == r"In all: 1 mug \| 0,0,0 \| 9x9x9 \| on 5\n7 gold \| 1,1,1\; 8 bar moved 10\\; 199 box"
-    assert text.startswith(r"# a \| b\; c.l3r: 200 things")
+    assert text.startswith(r"# a \| b\; c.l3r: 200 objects")
 
 
 def test_the_text_says_that_names_are_data(memory: SceneMemory) -> None:
@@ -216,7 +216,7 @@ def test_the_pack_is_whole(memory: SceneMemory, tmp_path: Path) -> None:
 
 
 def test_grids_of_many_things_hold_those_that_have_a_row(memory: SceneMemory, tmp_path: Path) -> None:
-    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90, things_on_grids=1))
+    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90, objects_on_grids=1))
     maps = json.loads((tmp_path / "pack/cognitive_map.json").read_text())
     listed = json.loads((tmp_path / "pack/list3r-prompt.json").read_text())["listed"]
     things = [i.id for i in memory.instances()]

@@ -213,7 +213,7 @@ def test_the_program_says_counts_and_yes_or_no(room: Room, capsys: pytest.Captur
 
 
 def test_a_prompt_says_what_of_its_question_is_not_known(room: Room) -> None:
-    assert "no thing is known as 'elephant'" in room[0].prompt(2000, "where is the elephant?").text
+    assert "no instance is known as 'elephant'" in room[0].prompt(2000, "where is the elephant?").text
     assert "no thing" not in room[0].prompt(2000, "where is the cat?").text
     listed = room[0].prompt(260, "what is on the couch?").listed
     assert {room[1][n] for n in listed[:2]} == {"sofa", "cat"}

@@ -9,18 +9,18 @@ from scipy.spatial import cKDTree
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.gaps import surface_gap
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import BOX, SPHERE, SimulatedThing
+from list3r.simulation.worlds.objects import BOX, SPHERE, SimulatedObject
 from list3r.simulation.worlds.truth import true_relations
 from list3r.simulation.worlds.world import make_world
 
 GREY = Material("plain", (120, 120, 120), (130, 130, 130), 0.3)
 
 
-def put(id: int, parts: f.Parts, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> SimulatedThing:
-    return SimulatedThing(id, "thing", parts, (x, y, z), float(np.deg2rad(yaw_deg)))
+def put(id: int, parts: f.Parts, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> SimulatedObject:
+    return SimulatedObject(id, "thing", parts, (x, y, z), float(np.deg2rad(yaw_deg)))
 
 
-def cube(id: int, x: float, y: float, yaw_deg: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> SimulatedThing:
+def cube(id: int, x: float, y: float, yaw_deg: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> SimulatedObject:
     return put(id, (f.block((0.2, 0.2, 0.2), (0, 0, 0.1), GREY, yaw),), x, y, z, yaw_deg)
 
 
@@ -60,10 +60,10 @@ def test_is_that_of_the_nearest_of_many_surface_points(seed: int) -> None:
             assert gap - 1e-3 <= sampled <= gap + 0.03 or gap == 0.0
 
 
-def surface_of(thing: SimulatedThing, rng: np.random.Generator, count: int = 3000) -> np.ndarray:
+def surface_of(obj: SimulatedObject, rng: np.random.Generator, count: int = 3000) -> np.ndarray:
     """Points on the surfaces of the parts, world. Shape (N, 3)."""
     out = []
-    for part in thing.parts:
+    for part in obj.parts:
         p = rng.uniform(-1, 1, (count, 3))
         if part.kind == BOX:
             face = rng.integers(3, size=count)
@@ -76,7 +76,7 @@ def surface_of(thing: SimulatedThing, rng: np.random.Generator, count: int = 300
             p[:, :2] /= np.linalg.norm(p[:, :2], axis=1, keepdims=True)
             p = p * part.half
         out.append(p + part.center)
-    return np.concatenate(out) @ thing.rotation().T + thing.position
+    return np.concatenate(out) @ obj.rotation().T + obj.position
 
 
 def test_next_to_is_told_by_surfaces_and_both_ways() -> None:
@@ -84,4 +84,4 @@ def test_next_to_is_told_by_surfaces_and_both_ways() -> None:
     found = {(s, o) for s, p, o in true_relations(world) if p == "next_to"}
     assert found and all((o, s) in found for s, o in found)
     for s, o in found:
-        assert surface_gap(world.thing(s), world.thing(o)) <= 0.4
+        assert surface_gap(world.object_of(s), world.object_of(o)) <= 0.4

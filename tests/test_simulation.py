@@ -10,9 +10,9 @@ from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
 from list3r.simulation.rendering.render import RenderedFrame, Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
-from list3r.simulation.walk import PathSettings, camera_path, look_poses
+from list3r.simulation.walk import PathSettings, camera_path, viewing_poses
 from list3r.simulation.worlds.materials import Material, bake
-from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, SimulatedThing
+from list3r.simulation.worlds.objects import BOX, CYLINDER, SPHERE, Part, SimulatedObject
 from list3r.simulation.worlds.truth import footprint_gap, true_relations, world_truth
 from list3r.simulation.worlds.world import SimulatedWorld, make_world
 
@@ -43,22 +43,22 @@ def test_a_seed_makes_one_world() -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_things_stand_on_what_they_are_said_to_stand_on(seed: int) -> None:
     world = make_world(seed)
-    for thing in world.things:
-        if thing.support is None or thing.container is not None:
+    for obj in world.objects:
+        if obj.support is None or obj.container is not None:
             continue
-        box, base = thing.box(), world.thing(thing.support).box()
+        box, base = obj.box(), world.object_of(obj.support).box()
         bottom, top = box.center[2] - box.size[2] / 2, base.center[2] + base.size[2] / 2
-        assert bottom <= top + 1e-6, thing.label
+        assert bottom <= top + 1e-6, obj.label
         offset = np.abs((box.center - base.center) @ base.rotation)
-        assert np.all(offset[:2] <= base.size[:2] / 2), thing.label
-        if thing.label not in ("cushion", "pillow"):
-            assert bottom == pytest.approx(top, abs=1e-6), thing.label
+        assert np.all(offset[:2] <= base.size[:2] / 2), obj.label
+        if obj.label not in ("cushion", "pillow"):
+            assert bottom == pytest.approx(top, abs=1e-6), obj.label
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_small_things_keep_apart_and_are_not_tiny(seed: int) -> None:
     world = make_world(seed)
-    small = [t for t in world.things if t.label in ("mug", "box", "book", "ball", "bowl", "vase") and not t.container]
+    small = [t for t in world.objects if t.label in ("mug", "box", "book", "ball", "bowl", "vase") and not t.container]
     assert len(small) >= 14
     for k, a in enumerate(small):
         assert a.box().size.max() > 0.08
@@ -69,12 +69,12 @@ def test_small_things_keep_apart_and_are_not_tiny(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_big_things_stay_within_their_walls(seed: int) -> None:
     world = make_world(seed)
-    for thing in world.things:
-        if thing.structure is None:
-            corners = thing.box().corners()
+    for obj in world.objects:
+        if obj.structure is None:
+            corners = obj.box().corners()
             room = next(r for r in world.rooms if r.x0 <= corners[:, 0].mean() <= r.x1)
-            assert corners[:, 0].min() > room.x0 - 0.02 and corners[:, 0].max() < room.x1 + 0.02, thing.label
-            assert corners[:, 1].min() > -0.02 and corners[:, 1].max() < room.depth + 0.02, thing.label
+            assert corners[:, 0].min() > room.x0 - 0.02 and corners[:, 0].max() < room.x1 + 0.02, obj.label
+            assert corners[:, 1].min() > -0.02 and corners[:, 1].max() < room.depth + 0.02, obj.label
             assert corners[:, 2].min() > -1e-6
 
 
@@ -83,7 +83,7 @@ def test_relations_are_consistent(world: SimulatedWorld) -> None:
     assert len(triples) == len(set(triples))
     beside = {(s, o) for s, p, o in triples if p == "next_to"}
     assert beside and all((o, s) in beside for s, o in beside)
-    labels = {t.id: t.label for t in world.things}
+    labels = {t.id: t.label for t in world.objects}
     assert any(labels[s] == "mug" and labels[o] == "table" for s, p, o in triples if p == "on")
     assert any(labels[s] == "ball" and labels[o] in ("bowl", "basket") for s, p, o in triples if p == "in")
 
@@ -121,17 +121,17 @@ def test_fewer_frames_cut_the_walk_and_more_slow_it() -> None:
 
 def test_every_point_lies_in_the_box_of_its_thing(world: SimulatedWorld) -> None:
     renderer = Renderer(world, CAMERA)
-    boxes = {t.id: t.box() for t in world.things}
+    boxes = {t.id: t.box() for t in world.objects}
     _, poses = camera_path(world.tour, None, PathSettings())
     seen = set()
     for pose in poses[::29]:
         frame = renderer.render(pose)
         assert np.all(frame.ids > 0), "the rooms are closed"
         points = (rays() * frame.depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
-        for thing_id in np.unique(frame.ids):
-            box = boxes[int(thing_id)]
-            local = np.abs((points[frame.ids == thing_id] - box.center) @ box.rotation)
-            assert np.all(local <= box.size / 2 + 1e-3), world.thing(int(thing_id)).label
+        for object_id in np.unique(frame.ids):
+            box = boxes[int(object_id)]
+            local = np.abs((points[frame.ids == object_id] - box.center) @ box.rotation)
+            assert np.all(local <= box.size / 2 + 1e-3), world.object_of(int(object_id)).label
         seen |= set(np.unique(frame.ids).tolist())
     assert len(seen) > 40
 
@@ -139,12 +139,12 @@ def test_every_point_lies_in_the_box_of_its_thing(world: SimulatedWorld) -> None
 def single(part: Part) -> SimulatedWorld:
     """A world of one thing at the origin."""
     room = make_world(0).rooms[0]
-    return SimulatedWorld(0, (room,), (SimulatedThing(1, "thing", (part,), (0.0, 0.0, 0.0)),), ())
+    return SimulatedWorld(0, (room,), (SimulatedObject(1, "thing", (part,), (0.0, 0.0, 0.0)),), ())
 
 
 def view(eye: tuple[float, float, float], yaw_deg: float, pitch_deg: float = 0.0) -> np.ndarray:
     angles = [np.array([np.deg2rad(a)]) for a in (yaw_deg, pitch_deg, 0.0)]
-    return look_poses(np.array([eye]), *angles)[0]
+    return viewing_poses(np.array([eye]), *angles)[0]
 
 
 GREY = Material("plain", (120, 120, 120), (140, 140, 140))
@@ -183,11 +183,11 @@ def test_an_open_cylinder_shows_its_inside() -> None:
 
 
 def test_the_nearer_thing_hides_the_farther_whatever_the_order() -> None:
-    near = SimulatedThing(1, "near", (Part(BOX, (-1, 0, 0), (0.1, 0.1, 0.1), GREY),), (0.0, 0.0, 0.0))
-    far = SimulatedThing(2, "far", (Part(BOX, (1, 0, 0), (0.1, 3, 3), GREY),), (0.0, 0.0, 0.0))
+    near = SimulatedObject(1, "near", (Part(BOX, (-1, 0, 0), (0.1, 0.1, 0.1), GREY),), (0.0, 0.0, 0.0))
+    far = SimulatedObject(2, "far", (Part(BOX, (1, 0, 0), (0.1, 3, 3), GREY),), (0.0, 0.0, 0.0))
     room = make_world(0).rooms[0]
-    for things in ((near, far), (far, near)):
-        frame = Renderer(SimulatedWorld(0, (room,), things, ()), CAMERA).render(view((-3, 0, 0), 0))
+    for objects in ((near, far), (far, near)):
+        frame = Renderer(SimulatedWorld(0, (room,), objects, ()), CAMERA).render(view((-3, 0, 0), 0))
         assert frame.ids[60, 80] == 1
         assert frame.ids[10, 10] == 2
 
@@ -267,34 +267,36 @@ def test_changes_move_remove_and_add_what_they_say(seed: int) -> None:
     changes = random_changes(world, seed, moved=2, removed=1, added=1)
     after = apply_changes(world, changes)
     assert after == apply_changes(world, random_changes(world, seed, moved=2, removed=1, added=1))
-    before_ids, after_ids = {t.id for t in world.things}, {t.id for t in after.things}
-    removed = {c.thing for c in changes if c.kind == "removed"}
+    before_ids, after_ids = {t.id for t in world.objects}, {t.id for t in after.objects}
+    removed = {c.obj for c in changes if c.kind == "removed"}
     assert before_ids - after_ids == removed
     assert len(after_ids - before_ids) == 1
     for change in changes:
         if change.kind == "moved":
-            assert change.thing is not None
-            old, new = world.thing(change.thing), after.thing(change.thing)
+            assert change.obj is not None
+            old, new = world.object_of(change.obj), after.object_of(change.obj)
             assert new.parts == old.parts
             assert new.support == change.target != old.support
-    same = before_ids & after_ids - {c.thing for c in changes}
-    assert all(world.thing(k) == after.thing(k) for k in same)
+    same = before_ids & after_ids - {c.obj for c in changes}
+    assert all(world.object_of(k) == after.object_of(k) for k in same)
 
 
 def test_what_a_bowl_holds_moves_with_it() -> None:
     world = make_world(0)
-    bowl = next(t for t in world.things if t.label == "bowl" and any(x.container == t.id for x in world.things))
-    ball = next(t for t in world.things if t.container == bowl.id)
+    bowl = next(t for t in world.objects if t.label == "bowl" and any(x.container == t.id for x in world.objects))
+    ball = next(t for t in world.objects if t.container == bowl.id)
     other = next(
-        t for t in world.things if t.label == "box" and t.support not in (bowl.support, None) and not t.container
+        t for t in world.objects if t.label == "box" and t.support not in (bowl.support, None) and not t.container
     )
     assert other.support is not None
     roomy = apply_changes(world, (Change("removed", other.id),))
     after = apply_changes(roomy, (Change("moved", bowl.id, other.support, seed=1),))
     offset = np.array(ball.position) - np.array(bowl.position)
-    assert np.allclose(np.array(after.thing(ball.id).position) - np.array(after.thing(bowl.id).position), offset)
+    assert np.allclose(
+        np.array(after.object_of(ball.id).position) - np.array(after.object_of(bowl.id).position), offset
+    )
     gone = apply_changes(world, (Change("removed", bowl.id),))
-    assert ball.id not in {t.id for t in gone.things}
+    assert ball.id not in {t.id for t in gone.objects}
 
 
 def test_changes_that_make_no_sense_are_named() -> None:
@@ -314,7 +316,7 @@ def test_changes_that_make_no_sense_are_named() -> None:
 def test_the_truth_names_boxes_and_what_was_seen(world: SimulatedWorld) -> None:
     truth = world_truth(world, {13: {"frames": 4, "largest_px": 99}})
     entries = {e["id"]: e for e in truth["instances"]}
-    assert len(entries) == len(world.things)
+    assert len(entries) == len(world.objects)
     assert entries[13]["largest_px"] == 99
-    assert np.allclose(entries[13]["box"]["size"], world.thing(13).box().size, atol=1e-6)
+    assert np.allclose(entries[13]["box"]["size"], world.object_of(13).box().size, atol=1e-6)
     assert all(r["subject"] in entries and r["object"] in entries for r in truth["relations"])

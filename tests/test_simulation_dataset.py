@@ -41,12 +41,12 @@ def test_the_reader_finds_what_was_written(walk: Path) -> None:
 def test_points_of_all_frames_agree_on_the_things(walk: Path) -> None:
     world = SETTINGS.world()
     camera = SETTINGS.camera()
-    table = next(t for t in world.things if t.label == "table").box()
+    table = next(t for t in world.objects if t.label == "table").box()
     distances = []
     for k, frame in enumerate(open_source(walk).read(0, 26)):
         assert isinstance(frame, Frame) and frame.depth is not None and frame.T_source_cam is not None
         ids = cv2.imread(str(walk / "ids" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED)
-        v, u = np.nonzero((ids == next(t.id for t in world.things if t.label == "table")) & (frame.depth > 0))
+        v, u = np.nonzero((ids == next(t.id for t in world.objects if t.label == "table")) & (frame.depth > 0))
         z = frame.depth[v, u]
         local = np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
         points = local @ frame.T_source_cam[:3, :3].T + frame.T_source_cam[:3, 3]

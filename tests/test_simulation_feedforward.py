@@ -126,7 +126,7 @@ def test_exact_tracks_are_the_things_themselves(video: SimulatedVideo) -> None:
         ids = np.unique(video.ids[track.frames][masks])
         assert len(ids) == 1
         assert np.array_equal(masks, video.ids[track.frames] == ids[0])
-        assert instance.structure == (ids[0] in [t.id for t in video.world.things if t.structure is not None])
+        assert instance.structure == (ids[0] in [t.id for t in video.world.objects if t.structure is not None])
 
 
 def test_errors_are_those_of_the_models_it_stands_for(video: SimulatedVideo) -> None:
@@ -260,7 +260,7 @@ def test_descriptors_know_a_place_again_and_confuse_twins(twins: SimulatedVideo)
 def test_twins_have_like_features(twins: SimulatedVideo) -> None:
     looks = Appearance(twins, 32, 0.6, 0.25)
     unit = looks.full[1:] / np.linalg.norm(looks.full[1:], axis=1, keepdims=True)
-    cosine, kind = unit @ unit.T, looks.looks[1:]
+    cosine, kind = unit @ unit.T, looks.classes[1:]
     twin = (kind[:, None] == kind) & ~np.eye(len(kind), dtype=bool)
     assert twin.any() and cosine[twin].min() > 0.8
     assert np.quantile(cosine[kind[:, None] != kind], 0.99) < 0.75
@@ -269,7 +269,7 @@ def test_twins_have_like_features(twins: SimulatedVideo) -> None:
 def test_tracks_break_and_leak_and_things_side_by_side_stay_apart(video: SimulatedVideo) -> None:
     model = FeedForwardModel(video, seed=2)
     broken, mixed, known, structure = 0, 0, 0, 0
-    kinds = {t.id for t in video.world.things if t.structure is not None}
+    kinds = {t.id for t in video.world.objects if t.structure is not None}
     for k in range(3):
         library = model.chunk(ChunkSpan(k, 200 * k, 200 * k + 100)).library
         owners = []

@@ -50,8 +50,8 @@ def test_the_fast_caster_and_the_renderer_see_the_same() -> None:
     world = make_world(1)
     poses = camera_path(world.tour, None, PathSettings())[1][::40]
     shown = shot("twins")
-    for things, home, views in ((world.things, world, poses), (None, shown.building.world, shown.T_world_cam[::150])):
-        caster, renderer = Caster(things or home.things, camera), Renderer(home, camera)
+    for objects, home, views in ((world.objects, world, poses), (None, shown.building.world, shown.T_world_cam[::150])):
+        caster, renderer = Caster(objects or home.objects, camera), Renderer(home, camera)
         for pose in views:
             depth, ids = caster.cast(pose)
             frame = renderer.render(pose)
@@ -61,13 +61,13 @@ def test_the_fast_caster_and_the_renderer_see_the_same() -> None:
 
 def test_the_fast_caster_sees_movers_where_the_renderer_does() -> None:
     film = shot("dynamic")
-    camera, moving = preset_camera((64, 48)), [m.thing for m in film.movers]
-    caster = Caster(film.building.world.things, camera, moving)
+    camera, moving = preset_camera((64, 48)), [m.obj for m in film.movers]
+    caster = Caster(film.building.world.objects, camera, moving)
     renderer = Renderer(film.building.world, camera, moving)
     for k in (200, 500, 800):
         for scene in (caster.scene, renderer.scene):
             for mover in film.movers:
-                scene.place(mover.thing.id, mover.T_world_object[k])
+                scene.place(mover.obj.id, mover.T_world_object[k])
         depth, ids = caster.cast(film.T_world_cam[k])
         frame = renderer.render(film.T_world_cam[k])
         assert np.array_equal(ids, frame.ids)
@@ -82,7 +82,7 @@ def test_a_seed_makes_one_video(preset: str) -> None:
     one, again, other = shot(preset), make_shot(preset, 101), shot(preset, 102)
     assert one.building == again.building
     assert np.array_equal(one.T_world_cam, again.T_world_cam)
-    assert one.building.world.things != other.building.world.things
+    assert one.building.world.objects != other.building.world.objects
     count = min(len(one.T_world_cam), len(other.T_world_cam))
     assert np.abs(one.T_world_cam[:count] - other.T_world_cam[:count]).max() > 1
 
@@ -110,26 +110,26 @@ def test_the_building_is_closed_and_the_camera_in_the_open(preset: str) -> None:
     film = video(preset)
     assert np.all(film.ids > 0) and np.all(film.depth > 0.05)
     assert film.depth.shape == film.ids.shape == (len(film.time_s), 24, 32)
-    known = {t.id for t in film.world.things} | {m.id for m in film.movers}
-    assert len(known) == len(film.world.things) + len(film.movers)
-    assert set(np.unique(film.ids).tolist()) <= known == set(film.looks)
+    known = {t.id for t in film.world.objects} | {m.id for m in film.movers}
+    assert len(known) == len(film.world.objects) + len(film.movers)
+    assert set(np.unique(film.ids).tolist()) <= known == set(film.classes)
 
 
 def test_points_of_pixels_lie_on_their_things() -> None:
     film = video("dynamic")
-    boxes = {t.id: t.box() for t in film.world.things}
+    boxes = {t.id: t.box() for t in film.world.objects}
     camera = film.camera
     rays = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1) - [camera.cx, camera.cy]
     rays = np.concatenate([rays / camera.fx, np.ones((camera.height, camera.width, 1))], axis=-1)
-    reach = {m.thing.id: m.thing.box() for m in shot("dynamic").movers}
+    reach = {m.obj.id: m.obj.box() for m in shot("dynamic").movers}
     for k in range(0, len(film.time_s), 60):
         points = (rays * film.depth[k, ..., None]) @ film.T_world_cam[k, :3, :3].T + film.T_world_cam[k, :3, 3]
-        for thing_id in np.unique(film.ids[k]):
-            own = points[film.ids[k] == thing_id]
-            if thing_id in reach:
-                pose = next(m.T_world_object[k] for m in film.movers if m.id == thing_id)
+        for object_id in np.unique(film.ids[k]):
+            own = points[film.ids[k] == object_id]
+            if object_id in reach:
+                pose = next(m.T_world_object[k] for m in film.movers if m.id == object_id)
                 own = (own - pose[:3, 3]) @ pose[:3, :3]
-            box = reach.get(int(thing_id)) or boxes[int(thing_id)]
+            box = reach.get(int(object_id)) or boxes[int(object_id)]
             assert np.all(np.abs((own - box.center) @ box.rotation) <= box.size / 2 + 2e-3)
 
 
@@ -172,8 +172,8 @@ def test_twins_look_alike_and_are_two_places() -> None:
     film, house = video("twins"), shot("twins").building
     rooms = [room for room in house.rooms() if room.twin]
     a, b = (room for room in rooms if room.twin == rooms[0].twin)
-    assert [film.looks[k] for k in a.things] == [film.looks[k] for k in b.things]
-    assert not set(a.things) & set(b.things)
+    assert [film.classes[k] for k in a.objects] == [film.classes[k] for k in b.objects]
+    assert not set(a.objects) & set(b.objects)
     in_a, in_b = (np.flatnonzero([room.contains(x, y) for x, y in film.T_world_cam[:, :2, 3]]) for room in (a, b))
     assert len(in_a) > 100 and len(in_b) > 100
     assert covisibility(film, in_a[::5], in_b[::5]).max() < 0.2
@@ -246,14 +246,14 @@ def test_a_preset_is_written_as_a_sequence_with_its_movers(tmp_path: Path) -> No
     settings = PresetWalk(seed=101, preset="dynamic", frames=4, start=500, size=(64, 48), write_ids=True)
     root = write_walk(tmp_path / "dynamic", settings)
     film = shot("dynamic")
-    caster = Caster(film.building.world.things, settings.camera(), [m.thing for m in film.movers])
+    caster = Caster(film.building.world.objects, settings.camera(), [m.obj for m in film.movers])
     truth = json.loads((root / "truth.json").read_text())
     assert truth["preset"] == "dynamic" and truth["cuts"] == []
     assert [m["label"] for m in truth["movers"]] == ["person", "carton"]
     for k in range(4):
         ids = cv2.imread(str(root / "ids" / f"{k:06d}.png"), cv2.IMREAD_UNCHANGED)
         for told, mover in zip(truth["movers"], film.movers, strict=True):
-            caster.scene.place(mover.thing.id, mover.T_world_object[500 + k])
+            caster.scene.place(mover.obj.id, mover.T_world_object[500 + k])
             assert np.allclose(told["position"][k], mover.T_world_object[500 + k, :3, 3], atol=1e-5)
         assert np.array_equal(ids, caster.cast(film.T_world_cam[500 + k])[1])
     source = open_source(root)

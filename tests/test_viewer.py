@@ -273,7 +273,7 @@ def test_a_link_to_what_is_not_there_is_told_and_breaks_nothing(two_sessions: Pa
             open_page(viewer, ViewState(session=0, selected=12345, dark=True).encode())
             assert viewer.state == ViewState(dark=True)
             assert viewer.panel._message.content == (
-                "This memory has no session 0, which the link names. There is no thing 12345, which the link names."
+                "This memory has no session 0, which the link names. There is no instance 12345, which the link names."
             )
             viewer.reload()
             open_page(viewer, ViewState(session=1).encode())
@@ -353,7 +353,7 @@ def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path:
         viewer = Viewer(memory, ViewerSettings(0, clouds=CloudSettings(overview_points=1000)))
         try:
             browser.open(viewer.address)
-            browser.says("Click a thing, or search for one.")
+            browser.says("Click an instance, or search for one.")
             browser.fill("Find", "mug")
             browser.wait(lambda: browser.run("[...document.querySelectorAll('input')].some(i => i.value === 'mug')"))
             browser.press("Search")
@@ -393,13 +393,13 @@ def test_a_click_on_a_thing_selects_it(browser: Browser, room: Path) -> None:
         viewer = Viewer(memory, ViewerSettings(0))
         try:
             browser.open(viewer.address)
-            browser.says("Click a thing, or search for one.")
+            browser.says("Click an instance, or search for one.")
             browser.wait(viewer.server.get_clients)
             time.sleep(5.0)  # the page sets its first camera after it has connected
             viewer.select(CHAIR, look=True)
             browser.says("5 chair")
             viewer.select(None)
-            browser.says("Click a thing, or search for one.")
+            browser.says("Click an instance, or search for one.")
             browser.wait(lambda: _selects(browser, viewer))
             assert viewer.state.selected == CHAIR
         finally:
@@ -441,7 +441,7 @@ def test_a_slow_page_draws_less_while_its_camera_moves(browser: Browser, room: P
         viewer = Viewer(memory, ViewerSettings(0, clouds=CloudSettings(pause_s=3.0)))
         try:
             browser.open(viewer.address)
-            browser.wait(lambda: any(p.settled for p in viewer._pages.values()), 300)
+            browser.wait(lambda: any(p.at_rest for p in viewer._pages.values()), 300)
             (page,) = viewer._pages.values()
             assert not page.slow and page.seconds_a_point is None
             page.seconds_a_point = 1e-4  # as if it had been measured

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CutSettings
 from list3r.instances.learned.network import Classification, classify, two_layers
-from list3r.instances.learned.things import NODES_AT, SHOWN_NODES, thing_features
+from list3r.instances.learned.verdicts import NODES_AT, SHOWN_NODES, segment_features
 from training.fit import BLIND, SEEING, Blindness
 from training.graphs import Lesson
 from training.worlds.catalogue import LABELS
@@ -96,7 +96,7 @@ def table_of(arrays: Arrays, lessons: Sequence[Lesson], *, more: bool) -> ThingT
             groupings.append(np.unique(lesson.thing, return_inverse=True)[1].astype(np.int64))
         for grouping in groupings:
             iou, which, bound = overlaps(lesson, grouping)
-            said, x = thing_features(grouping, lesson.graph, told)
+            said, x = segment_features(grouping, lesson.graph, told)
             label = dict(zip(lesson.thing.tolist(), lesson.name.tolist(), strict=True))
             name = np.array([label.get(t, -1) for t in which.tolist()], np.int64)
             rows.append((x, iou > ONE_THING, np.where(iou > SAME_NAME, name, -1), bound | (said > 0.5)))

@@ -20,9 +20,9 @@ class DepthErrorSettings:
     """Errors of depth as shares of it, and confidence.
 
     Together they put depth off by 3 % on average. Confidence ranks pixels by their true error with a Spearman
-    coefficient of 0.35 to 0.5. It lies in three ways: bland surfaces that are wrong and confident, runs of frames that
-    are (`PoseErrorSettings.glitch_rate`), and good things that are doubted, which the paper names as what costs
-    confidence-only support its tables and chairs (3.2).
+    coefficient of 0.35 to 0.5. It is wrong in three ways: plain surfaces and runs of frames
+    (`PoseErrorSettings.glitch_rate`) that are wrong but confident, and good objects of low confidence, for which the
+    paper blames the loss of tables and chairs in confidence-only support (3.2).
     """
 
     noise: float = 0.006
@@ -37,7 +37,7 @@ class DepthErrorSettings:
     bland_known: float = 0.4
     """Share of that error that the confidence goes by: it is mostly wrong and confident."""
     flying_share: float = 0.35
-    """Share of the pixels beside a jump of depth that float between its sides."""
+    """Share of the pixels next to a jump of depth that float between its sides."""
     jump: float = 0.05
     """Relative difference between neighbours that counts as a jump."""
     lasting_frames: float = 6.0
@@ -51,7 +51,7 @@ class DepthErrorSettings:
     confidence_noise: float = 0.35
     """Deviation of the logarithm of the error that the confidence goes by."""
     doubted_share: float = 0.35
-    """Share of the things in a chunk that are right and yet doubted (chairs and tables from a new side)."""
+    """Share of the objects in a chunk that are right and yet doubted (chairs and tables from a new side)."""
     doubted_factor: tuple[float, float] = (0.08, 0.8)
     """Median and deviation of the logarithm of the factor on their confidence."""
 
@@ -101,7 +101,7 @@ def patches(
 
 def structure_mask(video: SimulatedVideo, frames: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Pixels of walls, floors and ceilings. Shape (F, H, W)."""
-    ids = [t.id for t in video.world.things if t.structure is not None]
+    ids = [t.id for t in video.world.objects if t.structure is not None]
     return np.isin(video.ids[frames], ids)
 
 
@@ -124,12 +124,12 @@ def _floating(
 def _doubt(
     video: SimulatedVideo, frames: NDArray[np.int64], settings: DepthErrorSettings, rng: np.random.Generator
 ) -> Floats:
-    """Factors on the confidence: things that are doubted without cause. Shape (F, H, W)."""
-    top = max(int(video.ids.max()), max((t.id for t in video.world.things), default=0))
+    """Factors on the confidence: objects that are doubted without cause. Shape (F, H, W)."""
+    top = max(int(video.ids.max()), max((t.id for t in video.world.objects), default=0))
     doubted = rng.random(top + 1) < settings.doubted_share
     median, spread = settings.doubted_factor
     factor = np.minimum(median * np.exp(spread * rng.standard_normal(top + 1)), 1.0)
-    for thing in video.world.things:
-        doubted[thing.id] &= thing.structure is None
+    for obj in video.world.objects:
+        doubted[obj.id] &= obj.structure is None
     doubted[[0, *(m.id for m in video.movers)]] = False
     return np.where(doubted, factor, 1.0).astype(np.float32)[video.ids[frames]]

@@ -1,11 +1,11 @@
-"""What things look like to a simulated network: embeddings of instances and descriptors of whole frames.
+"""Appearance in a simulated network: embeddings of instances and descriptors of whole frames.
 
-Two things of one class of appearance (twins) share their embedding but for a small part of their own. A frame's
-descriptor sums what is seen, so that twin rooms from like viewpoints look alike and one place from another side does
-not: what the paper says of frame similarity (A.2). The defaults are set so that cosines fall where those of trained
-place recognition are said to. Measured on seed 101 of six presets (10 to 90 % of the pairs): consecutive frames 0.95
-and more; revisits that share over half of the picture 0.7 to 0.97, those that share a twentieth to a half 0.3 to 0.9;
-places that share nothing 0.0 to 0.65, but up to 0.98 in twin rooms, where most pairs of 0.85 and more are false.
+Two objects of one class of appearance (twins) share their embedding but for a small own part. A frame's descriptor sums
+its content, so that twin rooms from similar viewpoints are similar and one place from another side is not, as the paper
+reports of frame similarity (A.2). The defaults match the published cosines of trained place recognition. Measured on
+seed 101 of six presets (10 to 90 % of the pairs): consecutive frames 0.95 and more; revisits with more than half of the
+picture shared 0.7 to 0.97, with a twentieth to a half 0.3 to 0.9; places that share nothing 0.0 to 0.65, but up to 0.98
+in twin rooms, where most pairs of 0.85 and more are false.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class EmbeddingSettings:
 
     size: int = 32
     label_part: float = 0.6
-    """Part of a class of appearance that all things of its label share, of unit length."""
+    """Part of a class of appearance that all objects of its label share, of unit length."""
     own_part: float = 0.25
-    """Length of what sets a thing apart from its twins, against unit length of what they share."""
+    """Length of an object's own part, against unit length of the part shared with its twins."""
     noise: float = 0.3
     """Length of the noise of each track's feature."""
     side_part: float = 0.0
-    """Part of the appearance that depends on the side a thing is seen from, of unit length."""
+    """Part of the appearance that depends on the side an object is seen from, of unit length."""
     light_part: float = 0.0
     """Part that another light than the first one replaces, of unit length."""
 
@@ -49,38 +49,38 @@ class FrameDescriptorSettings:
 
     size: int = 64
     content: float = 0.7
-    """Length of what is seen, wherever in the picture."""
+    """Length of the content, anywhere in the picture."""
     arrangement: float = 0.62
-    """Length of what is seen where in the picture and from which side."""
+    """Length of the content by place in the picture and viewing direction."""
     common: float = 0.4
-    """Length of what all indoor pictures share."""
+    """Length of the part shared by all indoor pictures."""
     noise: float = 0.14
     """Length of the noise that lasts over frames (blur, exposure, people)."""
     noise_frame: float = 0.05
     """Length of each frame's own noise."""
     structure_weight: float = 0.5
-    """Weight of walls, floors and ceilings, which look bland, against things of the same area."""
+    """Weight of walls, floors and ceilings, which are plain, against objects of the same area."""
     side_part: float = 0.5
-    """Part of a thing's appearance in the arrangement that depends on the side it is seen from, of unit length."""
+    """Part of an object's appearance in the arrangement that depends on the side it is seen from, of unit length."""
     light_part: float = 0.0
-    """Part of what is seen that another light than the first one replaces, of unit length."""
+    """Part of the content that another light replaces, of unit length."""
 
 
 class Appearance:
-    """Embeddings of the things of a video, one for each id."""
+    """Embeddings of the objects of a video, one for each id."""
 
     def __init__(self, video: SimulatedVideo, size: int, label_part: float, own_part: float) -> None:
-        labels = {t.id: t.label for t in video.world.things} | {m.id: m.label for m in video.movers}
+        labels = {t.id: t.label for t in video.world.objects} | {m.id: m.label for m in video.movers}
         words = {label: k for k, label in enumerate(sorted(set(labels.values())))}
         self.top = max([int(video.ids.max(initial=0)), *labels])
-        self.looks = np.array([video.looks.get(k, 10_000 + k) for k in range(self.top + 1)])
+        self.classes = np.array([video.classes.get(k, 10_000 + k) for k in range(self.top + 1)])
         self.shared = np.zeros((self.top + 1, size))
         self.full = np.zeros((self.top + 1, size))
         rest = np.sqrt(1 - label_part**2)
         for k in range(1, self.top + 1):
             word = words.get(labels.get(k, ""), len(words))
             shared = label_part * _unit([video.seed, 31, word], size) + rest * _unit(
-                [video.seed, 32, self.looks[k]], size
+                [video.seed, 32, self.classes[k]], size
             )
             self.shared[k] = shared / np.linalg.norm(shared)
             self.full[k] = self.shared[k] + own_part * _unit([video.seed, 33, k], size)
@@ -90,16 +90,16 @@ class Appearance:
         """Return appearances (top + 1, D) as they are in a light: another than the first replaces a part of them."""
         if light == 0 or part == 0.0:
             return vectors
-        fresh = {int(v): _unit([self._seed, 38, light, v], self._size) for v in set(self.looks.tolist())}
-        change = np.stack([fresh[int(v)] for v in self.looks])
+        fresh = {int(v): _unit([self._seed, 38, light, v], self._size) for v in set(self.classes.tolist())}
+        change = np.stack([fresh[int(v)] for v in self.classes])
         return np.asarray(
             np.sqrt(1 - part**2) * vectors + part * change * (np.linalg.norm(vectors, axis=1) > 0)[:, None]
         )
 
     def side(self, k: int, azimuth: Array) -> Array:
-        """Return what a thing shows from directions (V,), the mean over them. Shape (D,)."""
+        """Return an object's appearance, the mean over directions (V,). Shape (D,)."""
         turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
-        return np.asarray(turns.mean(axis=0) @ _waves([self._seed, 39, int(self.looks[k])], self._size))
+        return np.asarray(turns.mean(axis=0) @ _waves([self._seed, 39, int(self.classes[k])], self._size))
 
 
 def track_feature(
@@ -110,7 +110,7 @@ def track_feature(
     light: int = 0,
     azimuth: dict[int, Array] | None = None,
 ) -> Floats:
-    """Unit-length feature of a mask track that holds things in the given shares of its area. Shape (D,).
+    """Unit-length feature of a mask track that holds objects in the given shares of its area. Shape (D,).
 
     `azimuth` has the directions, radians, from which each of them was seen in the track's frames.
     """
@@ -127,20 +127,20 @@ def track_feature(
 def frame_descriptors(video: SimulatedVideo, settings: FrameDescriptorSettings, seed: int) -> Floats:
     """Unit-length descriptors of all frames of a video. Shape (F, D)."""
     count, size = len(video.ids), settings.size
-    looks = Appearance(video, size, 0.5, 0.0)
-    areas = _areas(video, looks.top)
-    structure = np.zeros(looks.top + 1, bool)
-    structure[[t.id for t in video.world.things if t.structure is not None]] = True
+    model = Appearance(video, size, 0.5, 0.0)
+    areas = _areas(video, model.top)
+    structure = np.zeros(model.top + 1, bool)
+    structure[[t.id for t in video.world.objects if t.structure is not None]] = True
     amount = np.sqrt(areas) * np.where(structure, settings.structure_weight, 1.0)
     amount[..., 0] = 0.0
     content, arrangement = np.zeros((count, size)), np.zeros((count, size))
     lights = video.lights()
-    azimuth = azimuths(video, looks.top)
+    azimuth = azimuths(video, model.top)
     for light in sorted(set(lights.tolist())):
         rows = lights == light
-        shown = looks.lit(looks.shared, light, settings.light_part)
+        shown = model.lit(model.shared, light, settings.light_part)
         content[rows] = _normalised(np.sqrt((amount[rows] ** 2).sum(axis=1)) @ shown)
-        arrangement[rows] = _normalised(_arranged(video, amount[rows], azimuth[rows], looks, shown, settings))
+        arrangement[rows] = _normalised(_arranged(video, amount[rows], azimuth[rows], model, shown, settings))
     rng = np.random.default_rng([seed, video.seed, 34])
     lasting = rng.standard_normal((count, size))
     for run in runs_of(np.arange(count)):
@@ -156,15 +156,15 @@ def _arranged(
     video: SimulatedVideo,
     amount: Array,
     azimuth: Array,
-    looks: Appearance,
+    model: Appearance,
     shown: Array,
     settings: FrameDescriptorSettings,
 ) -> Array:
-    """Sum over things and parts of the picture of how they look from the side that is seen, mixed by part. (F, D)."""
+    """Sum over objects and parts of the picture of their appearance from the visible side, mixed by part. (F, D)."""
     size, part = settings.size, settings.side_part
-    seeds = sorted({int(v) for v in looks.looks})
+    seeds = sorted({int(v) for v in model.classes})
     waves = {v: _waves([video.seed, 36, v], size) for v in seeds}
-    table = np.stack([waves[int(v)] for v in looks.looks])
+    table = np.stack([waves[int(v)] for v in model.classes])
     turns = np.stack([np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
     side = np.einsum("ftk,tkd->ftd", turns, table)
     seen = np.sqrt(1 - part**2) * shown[None] + part * side
@@ -174,7 +174,7 @@ def _arranged(
 
 
 def _areas(video: SimulatedVideo, top: int) -> Array:
-    """Shares of the picture that things fill in its six parts (two rows of three), softly. Shape (F, 6, top + 1)."""
+    """Shares of the picture that objects fill in its six parts (two rows of three), softly. Shape (F, 6, top + 1)."""
     count, height, width = video.ids.shape
     column = (np.arange(width) + 0.5) / width * 3 - 0.5
     row = (np.arange(height) + 0.5) / height * 2 - 0.5
@@ -189,13 +189,13 @@ def _areas(video: SimulatedVideo, top: int) -> Array:
 
 
 def azimuths(video: SimulatedVideo, top: int) -> Array:
-    """Direction from each thing to the camera in the thing's own frame, radians about its upright. (F, top + 1)."""
+    """Direction from each object to the camera in the object's own frame, radians about its upright. (F, top + 1)."""
     parts, cut = [], video.cuts[0] if video.later is not None else len(video.time_s)
     for world, rows in ((video.world, slice(0, cut)), (video.later or video.world, slice(cut, None))):
         place, yaw = np.zeros((top + 1, 2)), np.zeros(top + 1)
         round_ = np.zeros(top + 1, bool)
-        for thing in world.things:
-            place[thing.id], yaw[thing.id], round_[thing.id] = thing.box().center[:2], thing.yaw, thing.is_round()
+        for obj in world.objects:
+            place[obj.id], yaw[obj.id], round_[obj.id] = obj.box().center[:2], obj.yaw, obj.is_round()
         away = video.T_world_cam[rows, None, :2, 3] - place[None]
         azimuth = np.arctan2(away[..., 1], away[..., 0]) - yaw
         parts.append(np.where(round_, 0.0, azimuth))

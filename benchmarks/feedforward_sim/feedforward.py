@@ -1,17 +1,15 @@
-"""A simulated feed-forward reconstruction model: it stands in for pi^3 and a video segmenter where no weights are.
+"""A simulated feed-forward reconstruction model, in place of pi^3 and a video segmenter where no weights are. It
+distorts a simulated video as such models do: every chunk in a gauge of its own (any similarity), bent, drifting in
+scale, noisy, with a mostly correct confidence; moving objects placed differently by every chunk; tracks and features as
+in `simulated_instances`. Its errors are a function of the frames it is given together, so two overlapping chunks err
+differently on the frames they share. It never rejects unrelated frames: over a jump cut, and in a joint window of two
+places, it invents a relation.
 
-It sees a simulated video truly and hands out what such models make of it: every chunk in a gauge of its own (any
-similarity), bent, drifting in scale, noisy, with a confidence that mostly knows; things that move placed anew by every
-chunk; tracks and features as in `simulated_instances`. Its errors are a function of the frames it is given together, so
-two overlapping chunks err differently on the frames they share. It never admits that what it was given does not
-belong together: over a jump cut, and in a joint window of two places, it makes a relation up.
-
-Where the defaults come from: pi^3 in chunks of 100 frames, chained, errs by 0.04 to 0.15 m on the rooms of 7-Scenes
-and by 0.05 to 0.16 m on TUM fr1 (ATE after Sim(3)); its points lie 0.05 m from the truth (Chamfer, NRGBD), 2 % of the
-depth of a room. Measured here on seeds 101 to 103 by
-`benchmarks/feedforward.py`: 0.03 to 0.04 m within a chunk of `calm`, depth off by 3 %, scale drift of 0.5 to 1 % from
-end to end of a chunk, neighbours aligned to 0.03 to 0.05 m and 0.6 %, the chain of a calm walk 0.09 m off, one round
-through several rooms 0.12 to 0.23 m.
+Source of the defaults: pi^3 in chunks of 100 frames, chained, has errors of 0.04 to 0.15 m on the rooms of 7-Scenes and
+by 0.05 to 0.16 m on TUM fr1 (ATE after Sim(3)); its points are 0.05 m from the truth (Chamfer, NRGBD), 2 % of the depth
+of a room. Measured here on seeds 101 to 103 by `benchmarks/feedforward.py`: 0.03 to 0.04 m within a chunk of `calm`,
+depth off by 3 %, scale drift of 0.5 to 1 % from end to end of a chunk, neighbours aligned to 0.03 to 0.05 m and 0.6 %,
+the chain of a calm walk 0.09 m off, one round through several rooms 0.12 to 0.23 m.
 """
 
 from __future__ import annotations
@@ -53,7 +51,7 @@ class FeedForwardSettings:
     gauge_scale: float = 0.3
     """Deviation of the logarithm of a chunk's scale."""
     gauge_shift_m: float = 2.0
-    """Deviation of where its origin lies."""
+    """Deviation of where its origin is."""
     keyframe_step: int = 10
     """Frames from one keyframe to the next."""
     poses: PoseErrorSettings = field(default_factory=PoseErrorSettings)
@@ -64,8 +62,8 @@ class FeedForwardSettings:
 
     @staticmethod
     def unseen_home(bare: bool = False) -> FeedForwardSettings:
-        """Masks as discovery makes them in homes that it never saw, looks that change with the side and the light;
-        `bare` halls are mostly what all pictures share."""
+        """Masks as of discovery in unseen homes, appearance that changes with side and light; `bare` halls are mostly
+        the part shared by all pictures."""
         descriptors = FrameDescriptorSettings(light_part=0.85, common=0.8 if bare else 0.4)
         return FeedForwardSettings(instances=unseen_home_errors(), descriptors=descriptors)
 
@@ -91,8 +89,7 @@ class _Reconstructed:
 
     reconstruction: Reconstruction
     shift: Floats | None
-    """What to add to the points that depth gives by the one camera, chunk units: things that move, and frames of
-    another camera. Shape (F, H, W, 3)."""
+    """Offsets to points by depth, chunk units: moving objects, and frames of another camera. Shape (F, H, W, 3)."""
 
 
 class FeedForwardModel:
@@ -106,7 +103,7 @@ class FeedForwardModel:
         """Unit-length descriptors of all frames. Shape (F, D)."""
 
     def chunk(self, span: ChunkSpan) -> ChunkResult:
-        """What the model and the tracker make of one chunk."""
+        """Output of the model and the tracker for one chunk."""
         frames = self._checked(range(span.start, span.stop))
         seed = [self._seed, self._video.seed, 1, span.start, span.stop]
         made = self._reconstruct(frames, seed)
@@ -131,7 +128,7 @@ class FeedForwardModel:
     def __call__(
         self, u_session: int, u_frames: Sequence[int], v_session: int, v_frames: Sequence[int]
     ) -> JointWindow | None:
-        """The window of frames of two places; never None: the model makes up what it cannot know."""
+        """The window of frames of two places; never None: the model invents unknown relations."""
         u, v = (self._checked(sorted(set(int(f) for f in side))) for side in (u_frames, v_frames))
         if not len(u) or not len(v):
             return None
@@ -142,7 +139,7 @@ class FeedForwardModel:
         return JointWindow(_samples(one, None), _samples(two, None), "relative")
 
     def covisibility(self, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Shares of the standing world that frames truly see in common, the lesser of both ways. Shape (F, F)."""
+        """True covisibility of the static world between frames, the lesser of both ways. Shape (F, F)."""
         share = seen_share(self._video, frames, frames).astype(np.float64)
         return np.minimum(share, share.T)
 
@@ -189,7 +186,7 @@ class FeedForwardModel:
         return _Reconstructed(reconstruction, shift)
 
     def _errors(self, frames: NDArray[np.int64], seed: list[int]) -> Sim3:
-        """Where the model takes the part of the world that each frame sees to lie. Batched (F,)."""
+        """The placement of the part of the world that each frame sees. Batched (F,)."""
         poses = self._settings.poses
         shared = self.covisibility(frames)
         side = sides(shared, poses)
@@ -231,12 +228,12 @@ class FeedForwardModel:
 
 
 def _rigid(transform: Sim3) -> NDArray[np.float64]:
-    """Poses of cameras whose similarity is given; their scale goes into depth. Shape (F, 4, 4)."""
+    """Poses of cameras from similarities; the scale goes into depth. Shape (F, 4, 4)."""
     return Sim3(np.ones_like(transform.scale), transform.rotation, transform.translation).as_matrix()
 
 
 def _by_other_camera(made: Reconstruction, where: NDArray[np.int64], camera: Camera) -> Floats:
-    """What to add to the points of frames that another camera filmed than the first. Shape (N, H, W, 3)."""
+    """Offsets to the points of frames from another camera than the first. Shape (N, H, W, 3)."""
     height, width = made.depth.shape[1:]
     row, column = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
     one, two = (

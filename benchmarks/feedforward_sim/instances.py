@@ -16,7 +16,7 @@ from benchmarks.feedforward_sim.descriptors import (
     azimuths,
     track_feature,
 )
-from benchmarks.feedforward_sim.mask_errors import MaskErrorSettings, exchanged, parted, scraps
+from benchmarks.feedforward_sim.mask_errors import MaskErrorSettings, exchanged, fragments, parted
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.memory.masks import encode_mask
 from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
@@ -27,10 +27,10 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class InstanceErrorSettings:
-    """What goes wrong between things and mask tracks. Areas are of pictures of 64 x 48 pixels and scale with them."""
+    """Errors of mask tracks. Areas are of pictures of 64 x 48 pixels and scale with them."""
 
     small_px: float = 12.0
-    """A thing whose largest view has so many pixels is missed with a chance of 1/e, a larger one less."""
+    """An object with so many pixels in its largest view is missed with a chance of 1/e, a larger one less."""
     least_px: int = 5
     """Masks smaller than this are not made."""
     least_frames: int = 4
@@ -38,9 +38,9 @@ class InstanceErrorSettings:
     break_rate: float = 0.004
     """Chance at each frame that a track breaks and goes on under a new id."""
     gap_frames: int = 12
-    """A thing out of sight for longer comes back under a new id."""
+    """An object out of sight for longer comes back under a new id."""
     merge_share: float = 0.04
-    """Chance that a thing shares its track with one that it touches in the picture."""
+    """Chance that an object shares its track with one that it touches in the picture."""
     leak_rate: float = 0.01
     """Chance at each frame that a mask starts to spill over its border."""
     leak_frames: tuple[int, int] = (3, 12)
@@ -50,19 +50,19 @@ class InstanceErrorSettings:
     structure_seen: float = 0.85
     """Share of walls, floors and ceilings that get a track."""
     structure_known: float = 0.9
-    """Share of those that are known as such."""
+    """Share of pieces of structure that are known as such."""
     structure_false: float = 0.01
-    """Share of other things that are taken for structure."""
+    """Share of other objects that are taken for structure."""
     support_points: int = 300
     """Most support points of an instance."""
     masks: MaskErrorSettings = field(default_factory=MaskErrorSettings)
-    """What discovery gets wrong besides, in homes that it never saw."""
+    """Further errors of discovery in unseen homes."""
     embedding: EmbeddingSettings = field(default_factory=EmbeddingSettings)
 
 
 @dataclass(frozen=True)
 class ChunkGeometry:
-    """What the model made of a run of frames, in its own gauge."""
+    """Reconstruction of a run of frames, in its own gauge."""
 
     frames: NDArray[np.int64]
     """Shape (F,)."""
@@ -90,11 +90,11 @@ class _Track:
 
 def unseen_home_errors() -> InstanceErrorSettings:
     """Return the errors of discovery in homes that it never saw (research/discovery 0080): measured there are recall
-    0.61 to 0.84, precision 0.35 to 0.85 by masks, 0.3 merged pairs and 0.04 duplicates for each thing.
+    0.61 to 0.84, precision 0.35 to 0.85 by masks, 0.3 merged pairs and 0.04 duplicates for each object.
     """
     return InstanceErrorSettings(
         merge_share=0.2,
-        masks=MaskErrorSettings(missed=0.15, split=0.15, swapped=0.05, scraps=0.3),
+        masks=MaskErrorSettings(missed=0.15, split=0.15, swapped=0.05, fragments=0.3),
         embedding=EmbeddingSettings(noise=0.45, side_part=0.5, light_part=0.7),
     )
 
@@ -106,26 +106,26 @@ def simulate_library(
     rng = np.random.default_rng([*seed, 41])
     ids = video.ids[geometry.frames]
     tracks = _make_tracks(video, ids, geometry.points, settings, rng)
-    looks = Appearance(video, settings.embedding.size, settings.embedding.label_part, settings.embedding.own_part)
+    model = Appearance(video, settings.embedding.size, settings.embedding.label_part, settings.embedding.own_part)
     light = int(video.lights()[geometry.frames[0]]) if len(geometry.frames) else 0
-    colors = _in_light(_colors(video, looks.top), light)
-    azimuth = azimuths(video, looks.top)[geometry.frames] if settings.embedding.side_part else None
+    colors = _in_light(_colors(video, model.top), light)
+    azimuth = azimuths(video, model.top)[geometry.frames] if settings.embedding.side_part else None
     instances = tuple(
-        _instance(number, track, ids, geometry, _Looks(looks, colors, azimuth, light), settings, rng)
+        _instance(number, track, ids, geometry, _Appearance(model, colors, azimuth, light), settings, rng)
         for number, track in enumerate(tracks)
     )
     return LocalLibrary(instances, _cannot_link(tracks, ids.shape), FEATURE_SPACE)
 
 
 @dataclass(frozen=True)
-class _Looks:
-    """What things look like in a chunk."""
+class _Appearance:
+    """Appearance of objects in a chunk."""
 
     appearance: Appearance
     colors: NDArray[np.uint8]
-    """Of each thing. Shape (T, 3)."""
+    """Of each object. Shape (T, 3)."""
     azimuth: NDArray[np.float64] | None
-    """Direction from each thing to the camera of each frame, radians; None where looks do not depend on it. (F, T)."""
+    """Direction from each object to each camera, radians; None where appearance does not depend on it. (F, T)."""
     light: int
 
 
@@ -138,7 +138,7 @@ def _make_tracks(
 ) -> list[_Track]:
     top = int(ids.max(initial=0))
     areas = np.stack([np.bincount(i.ravel(), minlength=top + 1) for i in ids])
-    structure = {t.id for t in video.world.things if t.structure is not None}
+    structure = {t.id for t in video.world.objects if t.structure is not None}
     scale = ids.shape[1] * ids.shape[2] / (64 * 48)
     tracks: list[_Track] = []
     for group in _groups(ids, areas, structure, settings, rng):
@@ -164,9 +164,9 @@ def _make_tracks(
                 leaks = _spill(masks, settings, rng)
                 kept = (positions[shown], masks[shown]) if loose else (positions, masks)
                 tracks.append(_Track(group, *kept, known, leaks))
-    if settings.masks.scraps:
-        count = round(settings.masks.scraps * sum(not t.structure for t in tracks))
-        for positions, masks in scraps(ids, points, structure, count, settings.masks, rng):
+    if settings.masks.fragments:
+        count = round(settings.masks.fragments * sum(not t.structure for t in tracks))
+        for positions, masks in fragments(ids, points, structure, count, settings.masks, rng):
             tracks.append(_Track((int(ids[positions][masks][0]),), positions, masks, False, 0.0))
     return tracks
 
@@ -178,7 +178,7 @@ def _groups(
     settings: InstanceErrorSettings,
     rng: np.random.Generator,
 ) -> list[tuple[int, ...]]:
-    """Ids that share a track: mostly one, at times a thing and the one it touches most."""
+    """Ids that share a track: mostly one, at times an object and the one it touches most."""
     present = [int(k) for k in np.flatnonzero(areas.sum(axis=0)) if k > 0]
     taken: set[int] = set()
     out: list[tuple[int, ...]] = []
@@ -197,8 +197,8 @@ def _groups(
 def _most_touched(ids: NDArray[np.int32], k: int, excluded: set[int]) -> int | None:
     a, b = ids[:, :, 1:], ids[:, :, :-1]
     c, d = ids[:, 1:], ids[:, :-1]
-    beside = np.concatenate([b[a == k], a[b == k], d[c == k], c[d == k]])
-    count = np.bincount(beside)
+    around = np.concatenate([b[a == k], a[b == k], d[c == k], c[d == k]])
+    count = np.bincount(around)
     count[0] = 0
     count[[n for n in excluded if n < len(count)]] = 0
     return int(count.argmax()) if len(count) and count.max() > 0 else None
@@ -207,7 +207,7 @@ def _most_touched(ids: NDArray[np.int32], k: int, excluded: set[int]) -> int | N
 def _pieces(
     positions: NDArray[np.int64], settings: InstanceErrorSettings, rng: np.random.Generator
 ) -> list[NDArray[np.int64]]:
-    """Runs of one id: broken where the thing was out of sight, and now and then without cause."""
+    """Runs of one id: broken where the object was out of sight, and now and then without cause."""
     if not len(positions):
         return []
     broken = rng.random(len(positions) - 1) < settings.break_rate
@@ -238,20 +238,20 @@ def _instance(
     track: _Track,
     ids: NDArray[np.int32],
     geometry: ChunkGeometry,
-    looks: _Looks,
+    model: _Appearance,
     settings: InstanceErrorSettings,
     rng: np.random.Generator,
 ) -> LocalInstance:
     held = ids[track.positions][track.masks]
-    count = np.bincount(held, minlength=looks.appearance.top + 1)
+    count = np.bincount(held, minlength=model.appearance.top + 1)
     count[0] = 0
     share = {int(k): float(count[k]) / max(int(count.sum()), 1) for k in np.flatnonzero(count)}
-    support, plane = _support(track, held, geometry, looks.colors, settings, rng)
-    seen_from = None if looks.azimuth is None else {k: looks.azimuth[track.positions, k] for k in share}
+    support, plane = _support(track, held, geometry, model.colors, settings, rng)
+    seen_from = None if model.azimuth is None else {k: model.azimuth[track.positions, k] for k in share}
     return LocalInstance(
         local_id=number,
         track=_mask_track(track, geometry),
-        feature=track_feature(looks.appearance, share, settings.embedding, rng, looks.light, seen_from),
+        feature=track_feature(model.appearance, share, settings.embedding, rng, model.light, seen_from),
         support=support,
         stability=float(np.clip(0.97 - 0.5 * track.leaking - 0.1 * rng.random(), 0, 1)),
         plane=plane if track.structure else None,
@@ -309,10 +309,10 @@ def _support(
 
 
 def _colors(video: SimulatedVideo, top: int) -> NDArray[np.uint8]:
-    """Colour of each thing: that of its first part. Shape (top + 1, 3)."""
+    """Colour of each object: that of its first part. Shape (top + 1, 3)."""
     out = np.full((top + 1, 3), 128, np.uint8)
-    for thing in video.world.things:
-        out[thing.id] = np.clip(thing.parts[0].material.color, 0, 255)
+    for obj in video.world.objects:
+        out[obj.id] = np.clip(obj.parts[0].material.color, 0, 255)
     return out
 
 

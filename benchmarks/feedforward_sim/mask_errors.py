@@ -1,4 +1,4 @@
-"""What discovery gets wrong in homes that it never saw: things missed, split, exchanged, and scraps of walls."""
+"""Errors of discovery in unseen homes: objects missed, split, exchanged, and fragments of walls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MaskErrorSettings:
-    """Shares of things; none by default."""
+    """Shares of objects; none by default."""
 
     missed: float = 0.0
     """Missed whatever their size."""
@@ -21,13 +21,13 @@ class MaskErrorSettings:
     """Tracks that come as two, parted by a plane."""
     swapped: float = 0.0
     """Tracks that go over to something they touch."""
-    scraps: float = 0.0
-    """Pieces of walls and floors taken for things, for each track of a thing."""
-    scrap_radius: float = 0.12
+    fragments: float = 0.0
+    """Pieces of walls and floors taken for objects, for each track of an object."""
+    fragment_radius: float = 0.12
     """Of such a piece, as a share of the spread of the chunk's points."""
 
     def any(self) -> bool:
-        """Tell whether tracks of things are changed at all."""
+        """Return whether tracks of objects are changed at all."""
         return self.split > 0 or self.swapped > 0
 
 
@@ -39,9 +39,9 @@ def exchanged(
         return masks
     start = int(rng.integers(1, len(masks) - 1))
     left, right, inside = ids[start][:, :-1], ids[start][:, 1:], masks[start]
-    beside = np.concatenate([right[inside[:, :-1]], left[inside[:, 1:]]])
+    around = np.concatenate([right[inside[:, :-1]], left[inside[:, 1:]]])
     own = set(ids[start][inside].tolist())
-    others = [k for k in beside.tolist() if k > 0 and k not in own and k not in structure]
+    others = [k for k in around.tolist() if k > 0 and k not in own and k not in structure]
     if not others:
         return masks
     out = masks.copy()
@@ -59,7 +59,7 @@ def parted(masks: Bools, points: Floats, settings: MaskErrorSettings, rng: np.ra
     return [masks & side, masks & ~side]
 
 
-def scraps(
+def fragments(
     ids: NDArray[np.int32],
     points: Floats,
     structure: set[int],
@@ -67,7 +67,7 @@ def scraps(
     settings: MaskErrorSettings,
     rng: np.random.Generator,
 ) -> list[tuple[NDArray[np.int64], Bools]]:
-    """Return positions (V,) and masks (V, H, W) of pieces of structure: what lies about one of its points."""
+    """Return positions (V,) and masks (V, H, W) of pieces of structure around one of its points."""
     bare = np.isin(ids, sorted(structure))
     where = np.argwhere(bare)
     if not len(where):
@@ -76,7 +76,7 @@ def scraps(
     out = []
     for _ in range(count):
         f, y, x = where[rng.integers(len(where))]
-        near = np.linalg.norm(points - points[f, y, x], axis=-1) < settings.scrap_radius * spread
+        near = np.linalg.norm(points - points[f, y, x], axis=-1) < settings.fragment_radius * spread
         masks = near & (ids == ids[f, y, x])
         positions = np.flatnonzero(masks.sum(axis=(1, 2)) >= 5)
         if len(positions) >= 4:

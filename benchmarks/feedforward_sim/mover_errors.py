@@ -1,8 +1,6 @@
-"""What a simulated feed-forward model makes of things that move while they are filmed.
-
-Such models are trained on what stands still. They place a mover's points by the views about it: late, early, as if it
-stood still, nearer or farther, each chunk in its own way, at times with full confidence; and a large mover drags the
-camera along.
+"""Errors of a simulated feed-forward model on moving objects. // Such models are trained on static scenes. They place a
+mover's points by neighbouring views: late, early, as if static, nearer or farther, each chunk in its own way, at times
+with full confidence; and a large mover drags the camera along.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MoverErrorSettings:
-    """Errors on things that move."""
+    """Errors on objects that move."""
 
     lag_s: float = 0.5
     """Deviation of how late (or early) a chunk places a mover, seconds."""
@@ -31,12 +29,12 @@ class MoverErrorSettings:
     """Over how long that average is taken, seconds."""
     depth: float = 0.20
     """Deviation of the logarithm of the factor on a mover's depth. No published figure was at hand: it is set to
-    several times the error on what stands still, as parallax and motion cannot be told apart there."""
+    several times the error on static surfaces, as parallax and motion are ambiguous there."""
     steady_share: float = 0.7
     """Share of that deviation that a chunk keeps to; the rest comes and goes over `lasting_frames`."""
     lasting_frames: float = 20.0
     least_confidence: float = 0.35
-    """The factor on a mover's confidence lies between this and 1, the same for a chunk."""
+    """The factor on a mover's confidence is between this and 1, the same for a chunk."""
     pull: float = 0.04
     """Motion of the camera, as a share of the mover's motion, for a mover that fills the picture."""
 
@@ -46,7 +44,7 @@ class MoverErrors:
     """Errors that movers bring into a run of frames."""
 
     shift_m: Floats | None
-    """What to add to true points, world axes, metres; None without movers. Shape (F, H, W, 3)."""
+    """Offsets to true points, world axes, metres; None without movers. Shape (F, H, W, 3)."""
     depth_factor: Floats
     """Shape (F, H, W)."""
     confidence_factor: Floats

@@ -1,10 +1,9 @@
 """Errors of the poses that a simulated feed-forward model gives to the frames it reconstructs together.
 
-The error of a reconstruction is what its own observations leave open. Frames are tied by the surfaces they share, so
-the errors are drawn from the Gaussian whose precision is the Laplacian of the covisibility graph, in twists of Sim(3):
-parts of a chunk that see the same agree, a long chain of views bends and drifts in scale, two sides of a joint window
-lie to each other the worse the less they share, and sides that share nothing are not related at all: how they lie is
-then imagined (`placements`).
+The error of a reconstruction is the uncertainty of its observations. Shared surfaces constrain frames, so the errors
+are drawn from the Gaussian whose precision is the Laplacian of the covisibility graph, in twists of Sim(3): parts of a
+chunk that see the same agree, a long chain of views bends and drifts in scale, two sides of a joint window are related
+the worse the less they share, and the relation of sides that share nothing is imagined (`placements`).
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ class PoseErrorSettings:
     """Errors of poses and of the scale of each frame's geometry.
 
     The three of `bend_` were set together so that a chunk of 100 frames and a chain of chunks err as published (see
-    `feedforward`); their ratios are those of views of a scene: a turn of 0.18 degrees shifts what is 2.3 m away by
-    7 mm, 0.3 % of the depth, about as much as the shift and the scale.
+    `feedforward`); their ratios are those of views of a scene: a turn of 0.18 degrees shifts points 2.3 m away by 7 mm,
+    0.3 % of the depth, about as much as the shift and the scale.
     """
 
     bend_deg: float = 0.18
-    """Deviation of the rotation between views that share all they see, about the middle of what they see."""
+    """Deviation of the rotation between views of the same surface, about its middle."""
     bend_shift: float = 0.0022
     """The same for the shift, as a share of the depth."""
     bend_scale: float = 0.0036
@@ -54,17 +53,17 @@ class PoseErrorSettings:
     glitch_shift: float = 0.02
     """Deviation of the error of such a run; the shift as a share of the depth."""
     alike_radius_m: float = 0.3
-    """Look-alike things within so far of each other are taken for one thing when a relation is imagined."""
+    """Look-alike objects within so far of each other become one object in an imagined relation."""
     alike_least_score: float = 0.25
-    """Least weight of things that fall on look-alikes, in square roots of shares of the picture, for that."""
+    """Least weight of objects that fall on look-alikes, in square roots of shares of the picture, for that."""
     imagined_deg: float = 2.0
     imagined_shift_m: float = 0.03
     imagined_scale: float = 0.03
-    """Deviation about an imagined relation that lays look-alikes on each other; the scale's of its logarithm."""
+    """Deviation of an imagined relation that aligns look-alikes; the scale's of its logarithm."""
     unmoved_deg: float = 10.0
     unmoved_shift_m: float = 0.15
     unmoved_scale: float = 0.25
-    """The same about a camera that is taken not to have moved, where nothing looks alike."""
+    """The same for a camera assumed still, without look-alikes."""
 
 
 def bend(T_world_cam: Array, depth_m: Array, covisibility: Array, settings: PoseErrorSettings, seed: list[int]) -> Sim3:
@@ -106,7 +105,7 @@ def jitter(depth_m: Array, frames: NDArray[np.int64], settings: PoseErrorSetting
 
 
 def sides(covisibility: Array, settings: PoseErrorSettings) -> NDArray[np.int64]:
-    """Number of the side of each frame: frames tied by what they share, over others or at once. Shape (F,)."""
+    """Number of the side of each frame: frames connected by shared surfaces, directly or through others. Shape (F,)."""
     _, side = connected_components(covisibility >= settings.least_covisibility, directed=False)
     _, first = np.unique(side, return_index=True)
     rank = np.empty(len(first), np.int64)
@@ -122,10 +121,9 @@ def placements(
     settings: PoseErrorSettings,
     seed: list[int],
 ) -> Sim3:
-    """Where the model takes each frame's side to lie, as similarities of the world. Batched (F,).
-
-    The first side lies right. Another is laid on those before it so that look-alike things fall on one another; where
-    too little looks alike, so that the camera has hardly moved between the two frames that look most alike.
+    """The model's placement of each frame's side, as similarities of the world. Batched (F,). The first side is right.
+    Another is aligned with the earlier ones by look-alike objects; with too few of them the camera is assumed still
+    between the two most similar frames.
     """
     rng = np.random.default_rng([*seed, 13])
     placed = [Sim3.identity()]
@@ -135,7 +133,7 @@ def placements(
         pivot = video.T_world_cam[here][:, :3, 3].mean(axis=0)
         found, best = None, settings.alike_least_score
         for before in range(number):
-            S, score = _lay_on_look_alikes(video, frames[side == before], here, settings)
+            S, score = _align_look_alikes(video, frames[side == before], here, settings)
             if score > best:
                 found, best = placed[before] @ S, score
         if found is None:
@@ -156,7 +154,7 @@ def _unmoved(
     descriptors: NDArray[np.float32],
     placed: list[Sim3],
 ) -> tuple[Sim3, Array]:
-    """The motion that lays the cameras of the two frames that look most alike on each other; the second's place."""
+    """The motion that aligns the cameras of the two most similar frames; the second's place."""
     before, here = np.flatnonzero(side < number), np.flatnonzero(side == number)
     cosine = descriptors[before] @ descriptors[here].T
     a, b = np.unravel_index(int(np.argmax(cosine)), cosine.shape)
@@ -171,22 +169,22 @@ def _noise_about(pivot: Array, noise: tuple[float, float, float], rng: np.random
     return about @ Sim3.exp(x) @ about.inverse()
 
 
-def _lay_on_look_alikes(
+def _align_look_alikes(
     video: SimulatedVideo, frames_a: NDArray[np.int64], frames_b: NDArray[np.int64], settings: PoseErrorSettings
 ) -> tuple[Sim3, float]:
-    """The upright motion that lays most of what side b sees on look-alikes that side a sees, and how much that is."""
+    """The upright motion that aligns most of side b's content with look-alikes of side a, and its amount."""
     a, b = _weights(video, frames_a), _weights(video, frames_b)
     moving = {m.id for m in video.movers}
-    things = {t.id: t for t in video.world.things if t.structure is None and t.id not in moving}
-    one, two = [k for k in sorted(a) if k in things], [k for k in sorted(b) if k in things]
+    objects = {t.id: t for t in video.world.objects if t.structure is None and t.id not in moving}
+    one, two = [k for k in sorted(a) if k in objects], [k for k in sorted(b) if k in objects]
     best, found = 0.0, Sim3.identity()
     if not one or not two:
         return found, best
-    at_a, at_b = (np.array([things[k].box().center for k in side]) for side in (one, two))
-    alike = np.array([[video.looks.get(i, -i) == video.looks.get(j, -j) for j in two] for i in one])
+    at_a, at_b = (np.array([objects[k].box().center for k in side]) for side in (one, two))
+    alike = np.array([[video.classes.get(i, -i) == video.classes.get(j, -j) for j in two] for i in one])
     weight = np.sqrt(np.minimum.outer([a[i] for i in one], [b[j] for j in two])) * alike
     for m, n in np.argwhere(alike):
-        turn = rotation_exp(np.array([0.0, 0.0, things[one[m]].yaw - things[two[n]].yaw]))
+        turn = rotation_exp(np.array([0.0, 0.0, objects[one[m]].yaw - objects[two[n]].yaw]))
         moved = (at_b - at_b[n]) @ turn.T + at_a[m]
         near = np.linalg.norm(at_a[:, None] - moved[None], axis=2) < settings.alike_radius_m
         score = float((weight * near).max(axis=0).sum())
@@ -196,14 +194,14 @@ def _lay_on_look_alikes(
 
 
 def _weights(video: SimulatedVideo, frames: NDArray[np.int64]) -> dict[int, float]:
-    """Mean share of the pictures that each thing fills."""
+    """Mean share of the pictures that each object fills."""
     ids, count = np.unique(video.ids[frames], return_counts=True)
     total = float(len(frames) * video.camera.width * video.camera.height)
     return {int(k): float(n) / total for k, n in zip(ids, count, strict=True)}
 
 
 def _world_to_pivot(T_world_cam: Array, depth_m: Array, origin: Array) -> Array:
-    """Adjoints that take twists about `origin` to twists at the middle of what each frame sees. Shape (F, 7, 7)."""
+    """Adjoints that take twists about `origin` to twists at the middle of each frame's points. Shape (F, 7, 7)."""
     R = T_world_cam[:, :3, :3]
     t = T_world_cam[:, :3, 3] + depth_m[:, None] * R[:, :, 2] - origin
     back, at = np.swapaxes(R, 1, 2), -np.einsum("fji,fj->fi", R, t)

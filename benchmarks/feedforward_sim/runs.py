@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def runs_of(frames: Sequence[int] | NDArray[np.int64], most_gap: int = 5) -> list[slice]:
-    """Stretches of positions whose frame numbers ascend by at most `most_gap`."""
+    """Runs of positions with frame numbers that ascend by at most `most_gap`."""
     numbers = np.asarray(frames, np.int64)
     step = np.diff(numbers)
     starts = [0, *(np.flatnonzero((step <= 0) | (step > most_gap)) + 1).tolist(), len(numbers)]

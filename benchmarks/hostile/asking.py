@@ -59,7 +59,7 @@ EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "d
 
 
 def exports(*, costly: bool = False) -> list[str]:
-    """Return a command for each format whose package is there, of the costly formats or of the others."""
+    """Return a command for each installed format, of the costly formats or of the others."""
     known = {n: f for n, f in FORMATS.items() if (n in COSTLY) == costly}
     there = {n: f for n, f in known.items() if not f.package or importlib.util.find_spec(f.package)}
     endings = {
@@ -77,7 +77,7 @@ class Outcome:
     seconds: float
     """Processor time."""
     out: str
-    told: str
+    message: str
     """Standard error, or the error and its place."""
     peak_mb: int = 0
 
@@ -95,26 +95,26 @@ def ask(words: Sequence[str], longest_s: float | None = None, *, serves: bool = 
     """Run one command; one that serves is interrupted as by Ctrl-C."""
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace", write_through=True) for _ in range(2))
     started = time.process_time()
-    told = ""
+    message = ""
     _forget_peak()
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), _alarm(longest_s, serves):
             ended = str(run(list(words)))
     except _TooLongError as error:
-        ended, told = "hang", _place(error)
+        ended, message = "hang", _place(error)
     except SystemExit as stop:
         ended = str(stop.code)
     except BaseException as error:
-        ended, told = "traceback", f"{type(error).__name__}: {str(error)[:150]} at {_place(error)}"
+        ended, message = "traceback", f"{type(error).__name__}: {str(error)[:150]} at {_place(error)}"
     peak = peak_mb()
     if peak > MOST_MB and ended not in ("hang", "traceback"):
-        ended, told = "memory", f"{peak} MB"
+        ended, message = "memory", f"{peak} MB"
     printed, errors = (stream.detach().getvalue().decode() for stream in (out, err))  # type: ignore[attr-defined]
-    return Outcome(ended, time.process_time() - started, printed, told or errors[:300], peak)
+    return Outcome(ended, time.process_time() - started, printed, message or errors[:300], peak)
 
 
 def command_on(memory: Path, command: str, folder: Path) -> list[str]:
-    """Return the words of one of the commands above, about a memory; what it writes goes to a folder, anew."""
+    """Return the words of one of the commands above, about a memory; output goes to a new folder."""
     words = [str(folder / w) if w.startswith("OUT") else w for w in _words(command)]
     for made in (Path(word) for word in words if word.startswith(f"{folder / 'OUT'}") and Path(word).is_dir()):
         shutil.rmtree(made)
@@ -136,7 +136,7 @@ def warm_up(memory: Path, folder: Path, commands: Sequence[str]) -> None:
 
 
 def peak_mb() -> int:
-    """Return the most memory that this process had since `_forget_peak`, where the system tells it."""
+    """Return the most memory that this process had since `_forget_peak`, where the system reports it."""
     with contextlib.suppress(OSError):
         found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
         return int(found[1]) // 1024 if found else 0
@@ -149,7 +149,7 @@ def _forget_peak() -> None:
 
 
 def _ready_s() -> float:
-    """Return how long this process had a processor or stood in line for one, where the system tells it."""
+    """Return how long this process had a processor or waited for one, where the system reports it."""
     with contextlib.suppress(OSError):
         had, stood = Path("/proc/self/schedstat").read_text().split()[:2]
         return (int(had) + int(stood)) / 1e9

@@ -1,6 +1,6 @@
 """Small files that unpack to much, and large claims in small files: each is refused quickly and in little memory.
 
-Every bomb is met by a process of its own; processor time and the peak of its memory are what the system says of it.
+Every bomb is opened by its own process; the system reports its processor time and peak memory.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ process = subprocess.Popen(sys.argv[1:], stderr=subprocess.STDOUT)
 _, status, used = os.wait4(process.pid, 0)
 print(os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss)
 """
-"""A small process in between: what is started has at least the peak of what started it."""
+"""A small process in between: a child has at least the peak of its parent."""
 
 
 def run_bombs(folder: Path) -> dict[str, Any]:
-    """Return how each bomb ended: status, seconds of a processor, megabytes; and what is not as it must be."""
+    """Return how each bomb ended: status, seconds of a processor, megabytes; and violations."""
     rows: dict[str, dict[str, Any]] = {}
     problems = []
     for name, make in BOMBS.items():
@@ -74,7 +74,7 @@ def _met(words: list[str]) -> dict[str, Any]:
 
 
 def _walk(here: Path, name: str, data: bytes, command: str = "inspect") -> list[str]:
-    """A folder of which one file is the bomb."""
+    """A folder with one file that is the bomb."""
     write_source(here / "walk")
     for path in sorted((here / "walk").glob(name)):
         path.write_bytes(data)
@@ -112,7 +112,7 @@ def _r3d_depth(here: Path) -> list[str]:
 
 
 def _crowded_zip(here: Path) -> list[str]:
-    """An archive whose list has 600,000 members, all the same bytes."""
+    """An archive with a list of 600,000 members, all the same bytes."""
     entry = struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0)
     listing = b"".join(entry + b"%07d" % k for k in range(600_000))
     end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, len(listing), 0, 0)
@@ -137,7 +137,7 @@ def _sens_depth(here: Path) -> list[str]:
 
 
 def _bag(here: Path) -> list[str]:
-    """A bag of ROS 1 whose one chunk of bzip2 unpacks to a gigabyte."""
+    """A bag of ROS 1 with one chunk of bzip2 that unpacks to a gigabyte."""
     chunk = bz2.compress(bytes(10**9))
 
     def record(head: dict[str, bytes], data: bytes) -> bytes:
@@ -157,9 +157,9 @@ def _bag(here: Path) -> list[str]:
         struct.pack("<IIi", 1, 0, 0),
     )
     known = record({"op": b"\7", "conn": number, "topic": b"/rgb"}, words)
-    told = {"op": b"\6", "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", at), "count": struct.pack("<I", 1)}
-    told |= {"start_time": struct.pack("<II", 1, 0), "end_time": struct.pack("<II", 2, 0)}
-    chunks = record(told, number + struct.pack("<I", 1))
+    head = {"op": b"\6", "ver": struct.pack("<I", 1), "chunk_pos": struct.pack("<Q", at), "count": struct.pack("<I", 1)}
+    head |= {"start_time": struct.pack("<II", 1, 0), "end_time": struct.pack("<II", 2, 0)}
+    chunks = record(head, number + struct.pack("<I", 1))
     counts = {"op": b"\3", "index_pos": struct.pack("<Q", at + len(body) + len(index))}
     counts |= {"conn_count": struct.pack("<I", 1), "chunk_count": struct.pack("<I", 1)}
     head = record(counts, b"")
@@ -214,7 +214,7 @@ def _memory(here: Path, *statements: tuple[str, tuple[Any, ...]], command: str =
 
 
 def _track(here: Path) -> list[str]:
-    """A mask track whose arrays unpack to two gigabytes."""
+    """A mask track with arrays that unpack to two gigabytes."""
     blob = zipped(*((f"{k}.npy", 2**27) for k in range(16)))
     return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="query seen", more="2")
 

@@ -122,7 +122,7 @@ def _value(parameter: Any, rng: random.Random) -> str:
 
 @cache
 def _commands() -> tuple[tuple[tuple[str, ...], Any], ...]:
-    """Return all commands; those that take long stand there once, all others four times."""
+    """Return all commands; slow ones once, all others four times."""
     found: list[tuple[tuple[str, ...], Any]] = []
 
     def walk(command: Any, path: tuple[str, ...]) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 
 def png(width: int, height: int, bits: int = 8, colors: int = 1) -> bytes:
-    """Return a black PNG: a thousand times smaller than what it shows."""
+    """Return a black PNG: a thousand times smaller than its pixels."""
     packer, row = zlib.compressobj(9), bytes(1 + width * colors * bits // 8)
     data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
     kind = 2 if colors == 3 else 0
@@ -34,7 +34,7 @@ def jpeg(width: int, height: int) -> bytes:
 
 
 def mp4(frames: int, size: tuple[int, int] = (640, 480), *, fragments: bool = False) -> bytes:
-    """Return a video of a kilobyte whose index claims so many frames."""
+    """Return a video of a kilobyte with an index of so many frames."""
     unit = struct.pack(">9I", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
     width, height = size
     times = struct.pack(">4I", 0, 0, 1000, 1000)
@@ -75,7 +75,7 @@ def _full(name: bytes, flags: int, *parts: bytes) -> bytes:
 
 
 def zipped(*members: tuple[str, bytes | int], packing: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """An archive; a number stands for so many zeros."""
+    """An archive; a number means so many zeros."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", packing) as archive:
         for name, data in members:

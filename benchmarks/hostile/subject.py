@@ -1,4 +1,4 @@
-"""A small memory with something in every table: what is lied about, damaged and asked in `benchmarks/hardening.py`."""
+"""A small memory with rows in every table, for `benchmarks/hardening.py` to falsify, damage and query."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FRAMES, POINTS = 6, 80
 
 
 def write_subject(path: Path) -> Path:
-    """Write two sessions of one room with edges, events, votes, labels, bends and edits; a second in all."""
+    """Write two sessions of one room with edges, events, votes, labels, corrections and edits; a second in all."""
     with Store.create(path) as store:
         with store.transaction():
             write_small_room(store, small_picture(), frames=FRAMES, points=POINTS)

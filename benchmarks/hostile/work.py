@@ -35,17 +35,17 @@ class Tally:
         self.longest_s = max(self.longest_s, outcome.seconds)
         self.peak_mb = max(self.peak_mb, outcome.peak_mb)
         if not outcome.fine:
-            self.problem(what, command, f"{outcome.ended} {outcome.told}")
+            self.problem(what, command, f"{outcome.ended} {outcome.message}")
 
     def problem(self, what: str, command: str, ended: str) -> None:
-        """Keep what must not be."""
+        """Record a violation."""
         self.problems.append({"what": what[:600], "command": command[:200], "ended": ended[:400]})
         print(self.problems[-1], file=sys.stderr, flush=True)
 
     def batch(self, tries: int) -> Batch:
-        """Return what was counted."""
-        told = {"tries": tries, "counts": dict(self.counts), "problems": self.problems}
-        return told | {"longest_s": round(self.longest_s, 2), "peak_mb": self.peak_mb}
+        """Return the counts."""
+        message = {"tries": tries, "counts": dict(self.counts), "problems": self.problems}
+        return message | {"longest_s": round(self.longest_s, 2), "peak_mb": self.peak_mb}
 
 
 class Run:
@@ -74,7 +74,7 @@ class Run:
         return total(self.batches.values())
 
     def _go(self, work: Callable[[int], Batch], numbers: list[int], processes: int) -> list[int]:
-        """Do batches; the numbers of those that were under way when a process broke."""
+        """Do batches; returns the numbers of batches under way when a process broke."""
         todo, started = list(numbers), time.monotonic()
         under_way: dict[Future[Batch], int] = {}
         context = multiprocessing.get_context("spawn")
@@ -98,12 +98,12 @@ class Run:
         self._all[self.key] = {"asked": self.asked, **total(self.batches.values()), "batches": self.batches}
         write_json(self.path, self._all)
 
-    def finish(self, told: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Write what was told, or the sum of the batches without these, and return it."""
-        told = {"asked": self.asked, **(told or total(self.batches.values()))}
-        self._all[self.key] = told
+    def finish(self, message: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Write the given result, or the sum of the batches, and return it."""
+        message = {"asked": self.asked, **(message or total(self.batches.values()))}
+        self._all[self.key] = message
         write_json(self.path, self._all)
-        return told
+        return message
 
 
 def total(batches: Iterable[Batch]) -> dict[str, Any]:

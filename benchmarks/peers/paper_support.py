@@ -1,8 +1,8 @@
-"""Instance-aware merging as the paper writes it (sections 3.2, A.3 and A.4), for a row of `benchmarks/association.py`.
+"""Instance-aware merging as in the paper (sections 3.2, A.3 and A.4), for a row of `benchmarks/association.py`.
 
-All pairs that are confident give a first transformation; an instance whose delta(o) is large leaves; from what is left
-the support is sampled by confidence and coverage, and aligned with weights that are confidences. The paper gives no
-number for "large", for the cells or for the size of the sample; those here are ours, and say so.
+All confident pairs give a first transformation; instances with a large delta(o) are removed; from the rest the support
+is sampled by confidence and coverage, and aligned with confidences as weights. The paper gives no number for "large",
+for the cells or for the size of the sample; those here are ours, and marked so.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def paper_merging() -> Iterator[None]:
 
 
 def without_large_delta(pairs: Pairs, camera: Camera, settings: PaperSupportSettings) -> StaticSupport:
-    """Leave out the instances, by the masks of u, whose delta(o) is large. Raises `DegenerateError`."""
+    """Leave out the instances with a large delta(o), by the masks of u. Raises `DegenerateError`."""
     sure = confident(pairs, settings)
     if not sure.any():
         raise DegenerateError("no shared point has enough confidence in both chunks")

@@ -24,7 +24,7 @@ ROUNDS = 5
 
 
 def plain_support(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
-    """Align what an edge stands on: plainly where settings leave instances out, else as the product does."""
+    """Align the support of an edge: plainly where settings leave instances out, else as in builds."""
     if settings.instance_aware:
         return align_support(support, metric, settings)
     s = support

@@ -1,9 +1,9 @@
 """Align two dense reconstructions of the same frames: an entry for the point maps of any feed-forward model.
 
-Errors of neighbouring pixels go together, so a few thousand well spread pixels know as much as millions. They are read
-on a grid that shifts from frame to frame; what a first robust fit contradicts goes; and of what is left each part of
-space gives a like share, so that a near wall does not outvote the room. Space is divided by the middle of the two
-points: by one side alone, cells at the rim would prefer points that noise carried outwards, and the scale would grow.
+Errors of neighbouring pixels are correlated, so a few thousand well spread pixels suffice. They are read on a grid that
+shifts from frame to frame; outliers of a first robust fit are removed; and each part of space gives an equal share of
+the rest, so that a near wall does not outvote the room. Space is divided by the middle of the two points: by one side
+alone, cells at the rim would prefer points moved outwards by noise, and the scale would grow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class PointMapSettings:
     """Which pixels of two point maps make the support."""
 
     candidates: int = 75_000
-    """Pixels looked at, over all frames."""
+    """Pixels used, over all frames."""
     pairs: int = 25_000
     """Pixels that the alignment works on, at most."""
     least_confidence: float = 0.1
@@ -78,7 +78,7 @@ def align_point_maps(
 def _worth(
     S_v_u: Sim3, p_u: NDArray[np.float64], p_v: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weights by what confidence is worth, whatever its scale: one over the variance at its level. Shape (N,)."""
+    """Weights by the calibrated confidence, on any scale: one over the variance at its level. Shape (N,)."""
     off = S_v_u.apply(p_u) - p_v
     square = np.einsum("ni,ni->n", off, off)
     parts = np.array_split(np.argsort(weight, kind="stable"), _LEVELS)
@@ -108,7 +108,7 @@ def _candidates(
 
 
 def _contradicted(S_v_u: Sim3, p_u: NDArray[np.float64], p_v: NDArray[np.float64], gate: float) -> NDArray[np.bool_]:
-    """Pixels that a first fit contradicts; they lie apart, and equal shares of space would favour them. Shape (N,)."""
+    """Pixels that a first fit contradicts; they are apart, and equal shares of space would favour them. Shape (N,)."""
     off = S_v_u.apply(p_u) - p_v
     square = np.einsum("ni,ni->n", off, off)
     return np.asarray(square > gate**2 * np.median(square) + 1e-12 * np.median(np.einsum("ni,ni->n", p_v, p_v)))

@@ -1,17 +1,16 @@
-"""VGGT-Long's way from chunks to one world, written anew from its published code (DengKaiCQ/VGGT-Long, 6b9f61f).
+"""VGGT-Long's association of chunks, reimplemented from its published code (DengKaiCQ/VGGT-Long, 6b9f61f).
 
-Pi-Long (DengKaiCQ/Pi-Long, ae567d9) goes the same way by the same code: its loop selection, loop windows and optimiser
-are those files, its alignment the same rounds in single precision on a GPU. What differs is the network, and that its
-confidences lie in [0, 1], as those of the samples here do. So one row stands for both.
+Pi-Long (DengKaiCQ/Pi-Long, ae567d9) uses the same code: its loop selection, loop windows and optimiser are those files,
+its alignment the same rounds in single precision on a GPU. Only the network differs, and its confidences are in [0, 1],
+as those of the samples here. So one row is for both.
 
-What is taken from there, with the file: loop selection (LoopModels/LoopModel.py), windows and one loop a pair of chunks
+Parts, with the file: loop selection (LoopModels/LoopModel.py), windows and one loop a pair of chunks
 (loop_utils/sim3utils.py, vggt_long.py), alignment of point maps (sim3utils.py), loop edges through a joint window
 (vggt_long.py) and the optimiser (loop_utils/sim3loop.py, fastloop/solve_python.py). `base_config.yaml` has the
 settings. Lengths are those of the reconstruction, as there.
 
-Two things differ. Point maps are the samples on nested pixel grids that every variant of the benchmark works on, not
-all pixels. Chunks that share no frame, which there are only where cuts are given, get no edge; there the published
-code has none to offer.
+Two differences: point maps are the samples on nested pixel grids of every variant of the benchmark, not all pixels;
+chunks without shared frames, which exist only where cuts are given, get no edge, as in the published code.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class VggtLongSettings:
     least_similarity: float = 0.85
     """Cosine of two frames above which they may close a loop."""
     neighbours: int = 5
-    """Frames most alike that are looked at for each frame."""
+    """Most similar frames that are considered for each frame."""
     least_gap: int = 10
     """Frames nearer in time are no loop."""
     suppressed: int = 25
@@ -60,7 +59,7 @@ class VggtLongSettings:
 
 
 class Chunk(Protocol):
-    """What is read of a chunk."""
+    """Input of a chunk."""
 
     @property
     def frame_indices(self) -> NDArray[np.int64]: ...
@@ -123,7 +122,7 @@ def place(
 
 
 def find_loops(descriptors: NDArray[np.float32], settings: VggtLongSettings) -> list[tuple[int, int]]:
-    """Return pairs of frames (later, earlier) that look alike, the most alike first, thinned globally."""
+    """Return pairs of similar frames (later, earlier), the most similar first, thinned globally."""
     similarity = descriptors.astype(np.float64) @ descriptors.astype(np.float64).T
     found: dict[tuple[int, int], float] = {}
     for i in range(len(similarity)):
@@ -136,7 +135,7 @@ def find_loops(descriptors: NDArray[np.float32], settings: VggtLongSettings) -> 
 
 
 def _thinned(ranked: Sequence[tuple[int, int]], reach: int) -> list[tuple[int, int]]:
-    """Return the pairs whose ends lie near no end of a better one; an end's reach stops at the pair's other end."""
+    """Return the pairs with no end near an end of a better one; an end's reach stops at the pair's other end."""
     suppressed: set[int] = set()
     kept = []
     for earlier, later in ranked:
@@ -163,7 +162,7 @@ def loop_windows(
 
 
 def _window(span: tuple[int, int], frame: int, settings: VggtLongSettings) -> tuple[int, int]:
-    """Return the frames about one, moved to lie within its chunk."""
+    """Return the frames about one, moved to be within its chunk."""
     (start, stop), half = span, settings.half_window
     if frame - half < start:
         return start, min(stop, start + 2 * half)

@@ -1,9 +1,8 @@
-"""A phone's walk with stretches in which its pictures say little of where it is: a bare wall, a quick turn, no light.
-
-They were chosen before anything was built of them, as what every walk through a home has: someone turns to a wall and
-stands close before it, turns away quickly in lamp light, and for a moment holds a finger over the lens (or walks
-through a dark corridor). The given poses go on through all of it with their drift, as inertial odometry does; their
-jump falls to the end of the turn away from the wall, the dark comes after it.
+"""A phone's walk with stretches without visual cues: a bare wall, a quick turn, no light. They were chosen before any
+build, as typical of a walk through a home: someone turns to a wall and is close before it, turns away quickly in lamp
+light, and for a moment holds a finger over the lens (or walks through a dark corridor). The given poses go on through
+all of it with their drift, as inertial odometry does; their jump falls to the end of the turn away from the wall, the
+dark comes after it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from list3r.frames.base import Camera
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.projection import SolidScene
 from list3r.simulation.rendering.render import Renderer
-from list3r.simulation.walk import look_poses
+from list3r.simulation.walk import viewing_poses
 
 Array = NDArray[np.float64]
 
@@ -27,7 +26,7 @@ WALKED, WALL, TURN, DARK, LOWERED = "walked", "wall", "turn", "dark", "lowered"
 
 @dataclass(frozen=True)
 class BlindSettings:
-    """Where the camera cannot be followed by what it sees."""
+    """Where the camera cannot be tracked visually."""
 
     wall_at: float = 0.3
     """Share of the walk after which the camera turns to the nearest bare wall and comes back."""
@@ -67,7 +66,7 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
     _, poses = walk.poses()
     fps, at = walk.path.fps, round(blind.wall_at * len(poses))
     here = poses[at]
-    scene = SolidScene(walk.world().things)
+    scene = SolidScene(walk.world().objects)
     ends = _bare_wall(walk, scene, here, blind)
     before_wall = _between(*ends, round(blind.wall_s * fps))
     there, back = (_quick(a, b, fps, blind) for a, b in ((here, ends[0]), (ends[1], here)))
@@ -80,7 +79,7 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
 
 
 def exposed(T_world_cam: Array, k: int, fps: float, exposure_s: float, count: int = 7) -> list[Array]:
-    """Return the poses during the exposure in whose middle frame k was taken. Shape (4, 4) each."""
+    """Return the poses during the exposure of frame k. Shape (4, 4) each."""
     before, T, after = (T_world_cam[min(max(j, 0), len(T_world_cam) - 1)] for j in (k - 1, k, k + 1))
     shares = np.linspace(-0.5, 0.5, count) * exposure_s * fps
     return [_mixed(T, before if s < 0 else after, abs(s)) for s in shares]
@@ -90,7 +89,7 @@ def _bare_wall(walk: WalkSettings, scene: SolidScene, here: Array, blind: BlindS
     """Return the first and last pose before the wall: the nearest ones that see nothing but it, by a free way."""
     world, camera = walk.world(), Camera(*(side // 8 for side in walk.size), *_small(walk.camera()))
     renderer, eye = Renderer(world, camera), here[:3, 3]
-    walls = {t.id for t in world.things if t.structure == "wall"}
+    walls = {t.id for t in world.objects if t.structure == "wall"}
     room = min(world.rooms, key=lambda r: abs((r.x0 + r.x1) / 2 - eye[0]))
     off = blind.wall_m
     sides = [((0.0, -1.0), -90.0), ((0.0, 1.0), 90.0), ((-1.0, 0.0), 180.0), ((1.0, 0.0), 0.0)]
@@ -100,18 +99,18 @@ def _bare_wall(walk: WalkSettings, scene: SolidScene, here: Array, blind: BlindS
         x = room.x0 + share * (room.x1 - room.x0) if way[0] == 0 else (room.x0 + off if way[0] < 0 else room.x1 - off)
         y = share * room.depth if way[1] == 0 else (off if way[1] < 0 else room.depth - off)
         places = [np.array([x, y, eye[2]]) + s * blind.along_m * along for s in (-0.5, 0.5)]
-        T = look_poses(np.array(places), *(np.array([a, a]) for a in (np.radians(yaw_deg), 0.0, 0.0)))
+        T = viewing_poses(np.array(places), *(np.array([a, a]) for a in (np.radians(yaw_deg), 0.0, 0.0)))
         seen = {int(i) for pose in T for i in np.unique(renderer.render(pose).ids)}
         if len(seen) == 1 and seen <= walls and all(_free(scene, eye, place) for place in places):
             found.append((float(np.linalg.norm(places[0] - eye)), len(found), T))
     if not found:
-        raise ValueError(f"walk of seed {walk.seed}: no bare wall can be reached from where it is to turn aside")
+        raise ValueError(f"walk of seed {walk.seed}: no bare wall can be reached to turn aside to")
     _, _, T = min(found, key=lambda row: row[:2])
     return T[0], T[1]
 
 
 def _free(scene: SolidScene, start: Array, end: Array) -> bool:
-    """Whether nothing stands on the straight way."""
+    """Whether nothing is on the straight way."""
     low, high = scene.corners.min(axis=1) - 0.05, scene.corners.max(axis=1) + 0.05
     points = start + np.linspace(0, 1, 40)[:, None] * (end - start)
     inside = (points[:, None] > low) & (points[:, None] < high)
@@ -123,7 +122,7 @@ def _small(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _quick(start: Array, end: Array, fps: float, blind: BlindSettings) -> Array:
-    """Poses between two, of which neither is among them: it speeds up, and slows down. Shape (F, 4, 4)."""
+    """Poses between two, both excluded: it speeds up, and slows down. Shape (F, 4, 4)."""
     turn = np.degrees(abs(_turned(_angles(end)[0] - _angles(start)[0])))
     way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
     lasts_s = 1.5 * max(turn / blind.turn_deg_s, way / blind.step_m_s)
@@ -139,14 +138,14 @@ def _mixed(start: Array, end: Array, share: float) -> Array:
     """Return the pose at a share of the way, turned as a person turns: by yaw, pitch and roll. Shape (4, 4)."""
     a, b = _angles(start), _angles(end)
     place = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
-    return np.asarray(look_poses(place[None], *(np.array([v]) for v in a + share * _turned(b - a)))[0])
+    return np.asarray(viewing_poses(place[None], *(np.array([v]) for v in a + share * _turned(b - a)))[0])
 
 
 def _angles(T_world_cam: Array) -> Array:
-    """Yaw, pitch and roll of `look_poses`, radians. Shape (3,)."""
+    """Yaw, pitch and roll of `viewing_poses`, radians. Shape (3,)."""
     forward = T_world_cam[:3, 2]
     yaw, pitch = np.arctan2(forward[1], forward[0]), np.arcsin(np.clip(forward[2], -1.0, 1.0))
-    level = look_poses(np.zeros((1, 3)), np.array([yaw]), np.array([pitch]), np.zeros(1))[0]
+    level = viewing_poses(np.zeros((1, 3)), np.array([yaw]), np.array([pitch]), np.zeros(1))[0]
     right = T_world_cam[:3, 0]
     return np.array([yaw, pitch, np.arctan2(right @ level[:3, 1], right @ level[:3, 0])])
 

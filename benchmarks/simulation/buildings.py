@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.simulation.furnisher import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, moved
 from benchmarks.simulation.rooms import make_room
 from list3r.simulation.worlds.layout import Placer, Room
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.world import SimulatedWorld
 
 _GAP_M = 2 * HALF_WALL_M
@@ -22,7 +22,7 @@ class BuildingSettings:
     """Which rooms a building has."""
 
     north: tuple[str, ...]
-    """Kinds of the rooms north of the corridor from west to east. Rooms whose kind ends in the same `#name` are twins,
+    """Kinds of the rooms north of the corridor from west to east. Rooms of a kind with the same `#name` are twins,
     equal in everything but their place."""
     south: tuple[str, ...] = ()
     """Kinds south of the corridor; these rooms are turned by 180 degrees."""
@@ -44,7 +44,7 @@ class BuildingSettings:
 
 @dataclass(frozen=True)
 class PlacedRoom:
-    """A room where it stands."""
+    """A room at its place."""
 
     kind: str
     twin: str
@@ -55,7 +55,7 @@ class PlacedRoom:
     y1: float
     turn: float
     """Radians from the room's own axes to the world's."""
-    things: tuple[int, ...]
+    objects: tuple[int, ...]
     """Ids."""
     doorways: tuple[tuple[float, float], ...]
     """Middles of its open doors, world."""
@@ -92,8 +92,8 @@ def make_building(settings: BuildingSettings, seed: int) -> Building:
     rng = np.random.default_rng([seed, 21])
     catalogue = make_catalogue(Placer(rng))
     corridor_width = float(rng.uniform(*settings.corridor_m))
-    drawn: dict[str, tuple[RoomPlan, tuple[SimulatedThing, ...]]] = {}
-    things: list[SimulatedThing] = []
+    drawn: dict[str, tuple[RoomPlan, tuple[SimulatedObject, ...]]] = {}
+    objects: list[SimulatedObject] = []
     rows: list[tuple[PlacedRoom, ...]] = []
     for kinds, south in ((settings.north, False), (settings.south, True)):
         x, row = 0.0, []
@@ -103,15 +103,15 @@ def make_building(settings: BuildingSettings, seed: int) -> Building:
                 plan = _plan(rng, settings, name, links[::-1] if south else links)
                 drawn[name] = plan, make_room(Placer(rng), plan, catalogue)
             plan, parts = drawn[name]
-            row.append(_place(things, name, plan, parts, x, corridor_width, south))
+            row.append(_place(objects, name, plan, parts, x, corridor_width, south))
             x += plan.width + _GAP_M
         rows.append(tuple(row))
     length = max([settings.length_m, *(room.x1 for row in rows for room in row)])
     plan = _corridor_plan(rng, settings, length, corridor_width, rows)
-    corridor = _place(things, "corridor", plan, make_room(Placer(rng), plan, catalogue), 0.0, None, False)
+    corridor = _place(objects, "corridor", plan, make_room(Placer(rng), plan, catalogue), 0.0, None, False)
     rooms = tuple(Room(r.x0, r.x1, r.y1 - r.y0, r.turn != 0, r.y0) for row in rows for r in row)
     rooms += (Room(corridor.x0, corridor.x1, corridor_width, False),)
-    return Building(SimulatedWorld(seed, rooms, tuple(things), ()), corridor, rows[0], rows[1])
+    return Building(SimulatedWorld(seed, rooms, tuple(objects), ()), corridor, rows[0], rows[1])
 
 
 def _plan(rng: np.random.Generator, settings: BuildingSettings, name: str, links: tuple[bool, bool]) -> RoomPlan:
@@ -143,24 +143,24 @@ def _corridor_plan(
 
 
 def _place(
-    things: list[SimulatedThing],
+    objects: list[SimulatedObject],
     name: str,
     plan: RoomPlan,
-    parts: tuple[SimulatedThing, ...],
+    parts: tuple[SimulatedObject, ...],
     x: float,
     corridor_width: float | None,
     south: bool,
 ) -> PlacedRoom:
-    """Add a room's things to the building: north of the corridor, south of it and turned, or as the corridor."""
+    """Add a room's objects to the building: north of the corridor, south of it and turned, or as the corridor."""
     if corridor_width is None:
         origin, turn = (0.0, 0.0), 0.0
     elif south:
         origin, turn = (x + plan.width, -_GAP_M), float(np.pi)
     else:
         origin, turn = (x, corridor_width + _GAP_M), 0.0
-    offset = len(things)
-    placed = [moved(thing, *origin, turn, offset) for thing in parts]
-    things += placed
+    offset = len(objects)
+    placed = [moved(obj, *origin, turn, offset) for obj in parts]
+    objects += placed
     sign = -1.0 if south else 1.0
     corners = sorted([origin[0], origin[0] + sign * plan.width]), sorted([origin[1], origin[1] + sign * plan.depth])
     local = [door_middle(plan, door) for door in plan.doors if not door.closed]
@@ -170,7 +170,7 @@ def _place(
     return PlacedRoom(kind, twin, x0, y0, x1, y1, turn, tuple(t.id for t in placed), doorways)
 
 
-def appearance_classes(things: tuple[SimulatedThing, ...]) -> dict[int, int]:
-    """Class of appearance of each thing, from its label and parts: copies share one, wherever they stand."""
+def appearance_classes(objects: tuple[SimulatedObject, ...]) -> dict[int, int]:
+    """Class of appearance of each object, from its label and parts: copies share one, wherever they are."""
     classes: dict[object, int] = {}
-    return {t.id: classes.setdefault((t.label, t.parts), len(classes)) for t in things}
+    return {t.id: classes.setdefault((t.label, t.parts), len(classes)) for t in objects}

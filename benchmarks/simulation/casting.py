@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.simulation.rendering.projection import NEAR_M, SolidScene, screen_rectangles
-from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, SimulatedThing, Solids
+from list3r.simulation.worlds.objects import BOX, CYLINDER, SPHERE, SimulatedObject, Solids
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 _FIRST = 24
-"""Solids of a frame's first sweep, the nearest large ones, whose depth spares the second sweep what they hide."""
+"""Solids of a frame's first sweep, the nearest large ones, which occlude others in the second sweep."""
 
 
 class Caster:
-    """Casts depth and ids for one camera; things that move are put in their places through `scene`."""
+    """Casts depth and ids for one camera; objects that move are put in their places through `scene`."""
 
-    def __init__(self, things: Sequence[SimulatedThing], camera: Camera, moving: Sequence[SimulatedThing] = ()) -> None:
+    def __init__(self, fixed: Sequence[SimulatedObject], camera: Camera, moving: Sequence[SimulatedObject] = ()):
         self._camera = camera
-        self.scene = SolidScene(things, moving)
+        self.scene = SolidScene(fixed, moving)
         self._solids = self.scene.solids
         x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
@@ -49,7 +49,7 @@ class Caster:
             self._sweep(chosen, rects, nearest, frame, rank, depth, solid)
         shape = (self._camera.height, self._camera.width)
         hit = solid >= 0
-        ids = np.where(hit, self._solids.thing[solid], 0).astype(np.int32)
+        ids = np.where(hit, self._solids.object_id[solid], 0).astype(np.int32)
         return np.where(hit, depth, 0).astype(np.float32).reshape(shape), ids.reshape(shape)
 
     def _local_frame(self, T_world_cam: Array) -> tuple[Floats, Floats]:

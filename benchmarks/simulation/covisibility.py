@@ -17,9 +17,9 @@ Floats = NDArray[np.float32]
 
 MOST_DEG = 75.0
 """Angle between two lines of sight up to which a surface counts as seen again. Two cameras that face each other in a
-corridor see the same walls, but nobody knows them again."""
+corridor see the same walls but cannot be matched."""
 _TOLERANCE = 0.03
-"""Relative difference of depth up to which a point is seen, beyond what lies within a pixel of it."""
+"""Relative difference of depth up to which a point is seen, added to the range within a pixel of it."""
 _POINTS = 320
 """About how many pixels of a frame are asked after."""
 
@@ -27,7 +27,7 @@ _POINTS = 320
 def covisibility(video: SimulatedVideo, frames_a: Sequence[int], frames_b: Sequence[int]) -> Floats:
     """Share of the picture that two frames have in common, the lesser of both directions. Shape (A, B), in [0, 1].
 
-    Only what stands still counts: pixels of movers are left out on both sides, and what a mover hides is not seen. A
+    Only static surfaces count: pixels of movers are left out on both sides, and surfaces behind a mover are not seen. A
     surface counts as seen again from a direction that differs by at most `MOST_DEG`.
     """
     a, b = np.asarray(frames_a, dtype=np.int64), np.asarray(frames_b, dtype=np.int64)
@@ -40,7 +40,7 @@ def seen_share(
     frames_b: Sequence[int] | NDArray[np.int64],
     most_deg: float = MOST_DEG,
 ) -> Floats:
-    """Share of the static pixels of each frame a whose points are seen in each frame b. Shape (A, B), in [0, 1].
+    """Share of the static pixels of each frame a that are seen in each frame b. Shape (A, B), in [0, 1].
 
     Lines of sight to a point differ by at most `most_deg`.
     """
@@ -62,16 +62,16 @@ class Views:
     """Pictures of one camera."""
 
     depth: Floats
-    """Metres, 0 for what does not count. Shape (N, H, W)."""
+    """Metres, 0 for ignored pixels. Shape (N, H, W)."""
     T_world_cam: Array
     """Shape (N, 4, 4)."""
     camera: Camera
 
 
 def shared_view(a: Views, b: Views, most_deg: float = MOST_DEG) -> Floats:
-    """Share of the pixels with depth in each picture a whose points are seen in each picture b. Shape (A, B).
+    """Share of the pixels with depth in each picture a that are seen in each picture b. Shape (A, B).
 
-    A point is seen where its depth in b lies between the least and the greatest depth of the 3x3 pixels about it, 3 %
+    A point is seen where its depth in b is between the least and the greatest depth of the 3x3 pixels about it, 3 %
     added on either side, and where its two lines of sight differ by at most `most_deg`.
     """
     depth_a, T_world_a, depth_b, T_world_b, camera = a.depth, a.T_world_cam, b.depth, b.T_world_cam, a.camera

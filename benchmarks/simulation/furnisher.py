@@ -1,4 +1,4 @@
-"""Puts groups of things into a room: along its walls or in the open, never in a doorway."""
+"""Puts groups of objects into a room: along its walls or in the open, never in a doorway."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import Placer, Room
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 
 HALF_WALL_M = 0.05
 """Every room has its own half of each wall."""
@@ -36,7 +36,7 @@ class Door:
 
 @dataclass(frozen=True)
 class RoomPlan:
-    """What a room is to be."""
+    """Specification of a room."""
 
     kind: str
     """A key of `rooms.KINDS`."""
@@ -44,7 +44,7 @@ class RoomPlan:
     depth: float
     doors: tuple[Door, ...]
     clutter: float = 1.0
-    """Share of the small things that are put in."""
+    """Share of the small objects that are put in."""
     windows: int = 1
 
 
@@ -61,7 +61,7 @@ def door_middle(plan: RoomPlan, door: Door) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a building has bought many of: these things look alike wherever they stand."""
+    """Models that a building has many of: these objects have one appearance everywhere."""
 
     chair: f.Parts
     office_chair: f.Parts
@@ -102,7 +102,7 @@ def _office_chair(metal: Material, cloth: Material) -> f.Parts:
 
 @dataclass
 class Furnisher:
-    """Puts groups of things into one room: along its walls or in the open, never in a doorway."""
+    """Puts groups of objects into one room: along its walls or in the open, never in a doorway."""
 
     p: Placer
     plan: RoomPlan
@@ -113,7 +113,7 @@ class Furnisher:
 
     def along_wall(self, group: Callable[[Furnisher], tuple[float, float]], sides: tuple[str, ...] = SIDES) -> bool:
         """Build a group with its back to a wall; false when there is no room for it, and then nothing is built."""
-        first = len(self.p.things)
+        first = len(self.p.objects)
         width, depth = group(self)
         for _ in range(40):
             side = sides[self.p.rng.integers(len(sides))]
@@ -125,12 +125,12 @@ class Furnisher:
             if self._claim(footprint(x, y, yaw, width, depth)):
                 self._move(first, x, y, yaw)
                 return True
-        del self.p.things[first:]
+        del self.p.objects[first:]
         return False
 
     def in_the_open(self, group: Callable[[Furnisher], tuple[float, float]], off_m: float = 0.6) -> bool:
         """Build a group near the middle of the room."""
-        first = len(self.p.things)
+        first = len(self.p.objects)
         width, depth = group(self)
         for k in range(40):
             yaw = float(self.p.rng.integers(4)) * 90.0
@@ -144,11 +144,11 @@ class Furnisher:
             if inside and self._claim(spot):
                 self._move(first, *back, yaw)
                 return True
-        del self.p.things[first:]
+        del self.p.objects[first:]
         return False
 
     def on_wall(self, label: str, parts: f.Parts, width: float, z: float, sides: tuple[str, ...] = SIDES) -> None:
-        """Hang something on a wall beside the doors."""
+        """Hang something on a wall next to the doors."""
         for _ in range(20):
             side = sides[self.p.rng.integers(len(sides))]
             long = self.plan.width if side in ("south", "north") else self.plan.depth
@@ -169,7 +169,7 @@ class Furnisher:
         self._hung: list[tuple[str, float, float]] = []
 
     def against(self, side: str, at: float, gap: float) -> tuple[float, float, float]:
-        """Place and yaw (degrees) of what has its back to a wall."""
+        """Place and yaw (degrees) of an object with its back to a wall."""
         w, d = self.plan.width, self.plan.depth
         return {
             "south": (at, gap, 0.0),
@@ -188,22 +188,22 @@ class Furnisher:
         return True
 
     def _move(self, first: int, x: float, y: float, yaw_deg: float) -> None:
-        self.p.things[first:] = [moved(t, x, y, np.deg2rad(yaw_deg)) for t in self.p.things[first:]]
+        self.p.objects[first:] = [moved(t, x, y, np.deg2rad(yaw_deg)) for t in self.p.objects[first:]]
 
 
-def moved(thing: SimulatedThing, x: float, y: float, yaw: float, id_offset: int = 0) -> SimulatedThing:
-    """The thing after a turn about the origin and a shift; its id and those it names rise by `id_offset`."""
+def moved(obj: SimulatedObject, x: float, y: float, yaw: float, id_offset: int = 0) -> SimulatedObject:
+    """The object after a turn about the origin and a shift; its id and the ids it refers to rise by `id_offset`."""
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
-    px, py, pz = thing.position
+    px, py, pz = obj.position
     at = (x + c * px - s * py, y + s * px + c * py, pz)
     support, container, attached = (
-        None if other is None else other + id_offset for other in (thing.support, thing.container, thing.attached)
+        None if other is None else other + id_offset for other in (obj.support, obj.container, obj.attached)
     )
     return replace(
-        thing,
-        id=thing.id + id_offset,
+        obj,
+        id=obj.id + id_offset,
         position=at,
-        yaw=float(thing.yaw + yaw),
+        yaw=float(obj.yaw + yaw),
         support=support,
         container=container,
         attached=attached,

@@ -1,6 +1,6 @@
-"""Groups of things that belong together: a desk with its chair and screen, a table with chairs round it.
+"""Groups of objects that belong together: a desk with its chair and screen, a table with chairs round it.
 
-Each function builds things about its own origin, back at y = 0, front towards +y, and returns its footprint, width and
+Each function builds objects about its own origin, back at y = 0, front towards +y, and returns its footprint, width and
 depth in metres.
 """
 
@@ -86,7 +86,7 @@ def dining_group(g: Furnisher) -> tuple[float, float]:
 
 
 def desk_group(g: Furnisher) -> tuple[float, float]:
-    """Desk, screen, chair and small things; the models are those of the building."""
+    """Desk, screen, chair and small objects; the models are those of the building."""
     desk = g.p.add(HERE, "desk", g.catalogue.desk, 0.0, 0.35, on=1)
     width = float(desk.box().size[0])
     g.p.add(HERE, "monitor", g.catalogue.monitor, float(g.p.rng.uniform(-0.2, 0.2)), 0.18, z=0.74, on=desk.id)
@@ -162,7 +162,7 @@ def armchair_group(g: Furnisher) -> tuple[float, float]:
 
 
 def cartons_group(g: Furnisher) -> tuple[float, float]:
-    """Equal cartons in a stack beside one on the floor."""
+    """Equal cartons in a stack next to one on the floor."""
     low = g.p.add(HERE, "carton", g.catalogue.carton, -0.2, 0.2, float(g.p.rng.uniform(-8, 8)), on=1)
     turn = float(g.p.rng.uniform(-20, 20))
     g.p.add(HERE, "carton", g.catalogue.carton, -0.2, 0.2, turn, z=0.261, on=low.id)

@@ -1,8 +1,8 @@
 """A walk through the rooms of a home with a phone that sinks where its holder opens a door.
 
-Chosen before anything was built of it, as what people record when they walk through a home: they film room after room,
-and at a door the hand that holds the phone goes down while the other one opens it. For a second or two the picture
-shows the floor, and what comes up next is another room. Half of the doors stand open, and nothing happens there.
+Chosen before any build, as typical of people who film a home: at a door the hand with the phone goes down while the
+other one opens it. For a second or two the picture shows the floor, and then another room. Half of the doors are open,
+and nothing happens there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.simulation.blind import LOWERED, TURN, WALKED, BlindWalk
 from benchmarks.simulation.presets import make_shot
 from benchmarks.simulation.walks import PresetWalk
-from list3r.simulation.walk import look_poses
+from list3r.simulation.walk import viewing_poses
 
 Array = NDArray[np.float64]
 
@@ -25,9 +25,9 @@ class LoweredSettings:
     """How a phone is lowered at a door."""
 
     share: float = 0.5
-    """Of the doorways that are walked through, those whose door must be opened."""
+    """Share of doorways with a door that must be opened."""
     pitch_deg: float = -70.0
-    """Of the camera while it is lowered: it looks at the floor before the feet."""
+    """Pitch of the lowered camera, at the floor before the feet."""
     sinks_s: float = 0.5
     """Time in which it sinks, and in which it comes up again."""
     before_s: float = 0.8
@@ -75,6 +75,6 @@ def _pitched(T_world_cam: Array, share: Array, pitch: float) -> Array:
     forward, right = T_world_cam[:, :3, 2], T_world_cam[:, :3, 0]
     yaw = np.arctan2(forward[:, 1], forward[:, 0])
     held = np.arcsin(np.clip(forward[:, 2], -1.0, 1.0))
-    level = look_poses(T_world_cam[:, :3, 3], yaw, held, np.zeros(len(yaw)))
+    level = viewing_poses(T_world_cam[:, :3, 3], yaw, held, np.zeros(len(yaw)))
     roll = np.arctan2((right * level[:, :3, 1]).sum(axis=1), (right * level[:, :3, 0]).sum(axis=1))
-    return look_poses(T_world_cam[:, :3, 3], yaw, held + share * (pitch - held), roll)
+    return viewing_poses(T_world_cam[:, :3, 3], yaw, held + share * (pitch - held), roll)

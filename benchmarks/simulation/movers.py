@@ -1,4 +1,4 @@
-"""What moves while it is filmed: a person who walks about before the camera, and a thing that is carried away."""
+"""Moving objects: a person who walks before the camera, and an object that is carried away."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.simulation.routes import FreeMap
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import Placer
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import MovingThing, SimulatedThing
+from list3r.simulation.worlds.objects import MovingObject, SimulatedObject
 
 Array = NDArray[np.float64]
 
@@ -22,18 +22,18 @@ _HASTE_M_S = 1.3
 
 def make_movers(
     building: Building, free: FreeMap, T_world_cam: Array, fps: float, rng: np.random.Generator
-) -> tuple[MovingThing, ...]:
+) -> tuple[MovingObject, ...]:
     """A walking person and a carton that the person carries away in the middle of the video."""
-    first = max(t.id for t in building.world.things) + 1
+    first = max(t.id for t in building.world.objects) + 1
     p = Placer(rng)
     xy, yaw = _stroll(free, T_world_cam, fps, rng)
-    person = MovingThing(
-        SimulatedThing(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw)
+    person = MovingObject(
+        SimulatedObject(first, "person", _person(p), (0.0, 0.0, 0.0)), upright_poses(xy, np.zeros(len(xy)), yaw)
     )
     size = (float(rng.uniform(0.36, 0.46)), float(rng.uniform(0.28, 0.36)), float(rng.uniform(0.26, 0.36)))
     carton = f.carton(size, p.bright("stripes", 0.4), p.bright("plain", 0.3))
-    return person, MovingThing(
-        SimulatedThing(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(free, T_world_cam, xy, yaw, fps, rng)
+    return person, MovingObject(
+        SimulatedObject(first + 1, "carton", carton, (0.0, 0.0, 0.0)), _carried(free, T_world_cam, xy, yaw, fps, rng)
     )
 
 
@@ -113,7 +113,7 @@ def _viterbi(free: FreeMap, places: Array, cost: Array, seconds: Array) -> Array
 
 
 def _carried(free: FreeMap, T_world_cam: Array, xy: Array, yaw: Array, fps: float, rng: np.random.Generator) -> Array:
-    """A carton that stands on the floor, is lifted by the person before the camera, carried, and set down elsewhere."""
+    """A carton that is on the floor, is lifted by the person before the camera, carried, and set down elsewhere."""
     frames = len(xy)
     held = xy + np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * 0.34
     lifts = np.arange(int(0.25 * frames), int(0.6 * frames), 10)
@@ -129,7 +129,7 @@ def _carried(free: FreeMap, T_world_cam: Array, xy: Array, yaw: Array, fps: floa
 
 
 def _views(free: FreeMap, T_world_cam: Array, xy: Array) -> int:
-    """How many of the cameras see a place on the floor, as far as walls tell."""
+    """How many of the cameras see a place on the floor, limited by walls."""
     offset = xy - T_world_cam[:, :2, 3]
     away = np.linalg.norm(offset, axis=1)
     along = np.einsum("nk,nk->n", offset, T_world_cam[:, :2, 2])

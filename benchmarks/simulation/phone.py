@@ -1,7 +1,7 @@
 """A simulated walk as a phone with LiDAR records it: sparse depth of 256 x 192 drawn over edges, poses that drift.
 
-The numbers of the sensor are our own model of what is published of it: 576 spots that are drawn to 256 x 192 along
-the picture, an error of centimetres that neighbouring pixels share, and confidence that is lost beside edges.
+The numbers of the sensor are our own model of published facts: 576 spots that are drawn to 256 x 192 along the picture,
+an error of centimetres that neighbouring pixels share, and confidence that is lost next to edges.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class LidarSettings:
     sigma_per_m: float = 0.004
     """Growth of the deviation with depth."""
     patch_px: float = 8.0
-    """Width over which errors are alike: spots lie 10 px apart."""
+    """Width over which errors are alike: spots are 10 px apart."""
     blur_px: float = 1.5
     """Width over which edges are drawn out."""
     edge_step: float = 0.04
@@ -60,7 +60,7 @@ class DriftSettings:
     tilt_deg: float = 0.15
     """Deviation of pitch and roll, which come and go."""
     jump_m: float = 0.12
-    """What the pose jumps by at once, as after a relocalisation."""
+    """Jump of the pose, as after a relocalisation."""
     jump_deg: float = 3.0
     """And turns by, about the vertical."""
     jump_at: float = 0.55
@@ -139,7 +139,7 @@ def write_phone_walk(
     drift: DriftSettings | None = None,
     way: BlindWalk | None = None,
 ) -> Path:
-    """Film a walk into `folder`: `walk.r3d`, and beside it `groundtruth.txt` and `truth.json`.
+    """Film a walk into `folder`: `walk.r3d`, and next to it `groundtruth.txt` and `truth.json`.
 
     `way` is the walk with stretches where the camera cannot be followed; `stretches.json` has the name of each frame's.
     """
@@ -166,8 +166,8 @@ def write_phone_walk(
         if stretch == DARK:
             depth, sure = np.zeros_like(depth), np.zeros_like(sure)
         out.add(Frame(k, time_s, color, depth, given[k]), sure)
-        for thing, area in zip(*np.unique(drawn.ids[drawn.ids > 0], return_counts=True), strict=True):
-            entry = seen.setdefault(int(thing), {"frames": 0, "largest_px": 0})
+        for obj, area in zip(*np.unique(drawn.ids[drawn.ids > 0], return_counts=True), strict=True):
+            entry = seen.setdefault(int(obj), {"frames": 0, "largest_px": 0})
             entry["frames"], entry["largest_px"] = entry["frames"] + 1, max(entry["largest_px"], int(area))
     out.close()
     write_tum(folder / "groundtruth.txt", Trajectory(way.time_s, way.T_world_cam))

@@ -1,4 +1,4 @@
-"""Videos by name: what kind of building, which way through it, what moves."""
+"""Videos by name: kind of building, way through it, movers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.simulation.takes import Shot, Take
 from benchmarks.simulation.video import MoverTruth, SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
-from list3r.simulation.walk import PathSettings, look_poses
+from list3r.simulation.walk import PathSettings, viewing_poses
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
@@ -25,11 +25,11 @@ Array = NDArray[np.float64]
 _FURNISHED = ("living room", "bedroom", "office", "kitchen", "meeting room", "storage")
 _FPS = 12.5
 _BEFORE_CUT = (1, 10, 20)
-"""Frames before a cut whose views must share nothing with the view after it."""
+"""Frames before a cut that must share nothing with the view after it."""
 
 
 _SOMETIMES_FAST = ("loop", "kidnap", "twins")
-"""Presets of which every third seed has a camera that turns nearly twice as fast."""
+"""Presets with a camera that turns nearly twice as fast in every third seed."""
 
 
 def preset_names() -> tuple[str, ...]:
@@ -79,13 +79,13 @@ def make_video(preset: str, seed: int, size: tuple[int, int] = (64, 48), movers:
     """
     camera = preset_camera(size)
     shot = make_shot(preset, seed, movers)
-    things = shot.building.world.things
-    caster = Caster(things, camera, [m.thing for m in shot.movers])
+    objects = shot.building.world.objects
+    caster = Caster(objects, camera, [m.obj for m in shot.movers])
     depth = np.empty((len(shot.time_s), camera.height, camera.width), np.float32)
     ids = np.empty(depth.shape, np.int32)
     for k, pose in enumerate(shot.T_world_cam):
         for mover in shot.movers:
-            caster.scene.place(mover.thing.id, mover.T_world_object[k])
+            caster.scene.place(mover.obj.id, mover.T_world_object[k])
         depth[k], ids[k] = caster.cast(pose)
     return SimulatedVideo(
         preset,
@@ -97,8 +97,8 @@ def make_video(preset: str, seed: int, size: tuple[int, int] = (64, 48), movers:
         depth,
         ids,
         shot.cuts,
-        tuple(MoverTruth(m.thing.id, m.thing.label, m.T_world_object) for m in shot.movers),
-        appearance_classes((*things, *(m.thing for m in shot.movers))),
+        tuple(MoverTruth(m.obj.id, m.obj.label, m.T_world_object) for m in shot.movers),
+        appearance_classes((*objects, *(m.obj for m in shot.movers))),
     )
 
 
@@ -248,11 +248,11 @@ def _jump(take: Take) -> Director:
 
 
 class _Glimpse:
-    """Small pictures of a building, to tell which views overlap."""
+    """Small pictures of a building, to find overlapping views."""
 
     def __init__(self, take: Take) -> None:
         self._camera = preset_camera((32, 24))
-        self._caster = Caster(take.building.world.things, self._camera)
+        self._caster = Caster(take.building.world.objects, self._camera)
 
     def common(self, T_world_a: Array, T_world_b: Array, most_deg: float) -> NDArray[np.float32]:
         """Share of the picture that views have in common, the lesser of both directions. Shape (A, B)."""
@@ -264,7 +264,7 @@ class _Glimpse:
 
 
 def _near_view(take: Take, director: Director, poses: Array, frame: int) -> View | None:
-    """What was looked at from some frame on, from another place in that room; None in corridors and doorways."""
+    """A view of a frame's target from another place in its room; None in corridors and doorways."""
     room = take.building.room_at(*poses[frame, :2, 3])
     if room is None or room.kind == "corridor":
         return None
@@ -363,7 +363,7 @@ _PRESETS: dict[str, _Preset] = {
 
 
 def _looking_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Return T_world_cam of an upright camera at `eye` that looks at `target`, metres. Shape (4, 4)."""
+    """Return T_world_cam of an upright camera at `eye` towards `target`, metres. Shape (4, 4)."""
     x, y, z = np.array(target) - np.array(eye)
     angles = [np.array([a]) for a in (np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), 0.0)]
-    return np.asarray(look_poses(np.array([eye]), *angles)[0])
+    return np.asarray(viewing_poses(np.array([eye]), *angles)[0])

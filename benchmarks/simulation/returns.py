@@ -1,14 +1,14 @@
-"""Videos in which a place is seen again, but not as before: where the likeness of pictures fails.
+"""Videos that return to a place of changed appearance, where frame similarity fails.
 
 Each has two runs with a cut between them. The first ends in some room, the second begins there:
 
-- opposite: from the other end of the room, looking the other way; the camera stands where it looked to before;
-- night: the same views in another light, which changes what things and pictures look like;
-- alike: in one of three rooms of one plan, which differ by the looks of three things each, and by where they stand;
-- moved: half of the furniture and of the small things moved in between, and the light changed;
-- halls: large bare halls with two or three things each;
+- opposite: from the other end of the room in the opposite direction;
+- night: the same views in another light, which changes the appearance of objects and pictures;
+- alike: in one of three rooms of one plan, which differ in appearance and place of three objects each;
+- moved: half of the furniture and of the small objects were moved in between, and the light changed;
+- halls: large bare halls with two or three objects each;
 - seasons: a kitchen in another light, by another camera of another field of view, held at another height, after half of
-  the small things were moved.
+  the small objects were moved.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.memory.errors import OptionError
 from list3r.simulation.walk import PathSettings
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.truth import footprint_gap
 from list3r.simulation.worlds.world import SimulatedWorld
 
@@ -42,9 +42,9 @@ Array = NDArray[np.float64]
 RETURNS = ("opposite", "night", "alike", "moved", "halls", "seasons")
 _KINDS = ("living room", "bedroom", "office", "kitchen", "meeting room", "storage")
 _STAYS = ("door", "door frame", "window", "picture", "whiteboard", "sink", "worktop", "wardrobe", "bookshelf")
-"""What is not moved about."""
+"""Kinds that are not moved."""
 _LIT = ("night", "moved", "seasons")
-"""Presets of which the second run has another light."""
+"""Presets with another light in the second run."""
 
 
 def make_return(preset: str, seed: int, size: tuple[int, int] = (64, 48)) -> SimulatedVideo:
@@ -57,7 +57,7 @@ def make_return(preset: str, seed: int, size: tuple[int, int] = (64, 48)) -> Sim
 
 
 def film_return(preset: str, seed: int) -> tuple[Take, SimulatedWorld | None]:
-    """Return the building and both runs of a preset, and the world of the second run where things were moved."""
+    """Return the building and both runs of a preset, and the world of the second run where objects were moved."""
     if preset not in RETURNS:
         raise OptionError(f"no preset {preset!r}: one of {', '.join(RETURNS)}")
     rng = np.random.default_rng([seed, 51, RETURNS.index(preset)])
@@ -89,16 +89,16 @@ def _building(preset: str, seed: int, rng: np.random.Generator) -> Building:
 
 
 def _distinct(world: SimulatedWorld, rooms: tuple[PlacedRoom, ...], rng: np.random.Generator) -> SimulatedWorld:
-    """Return the world with three things of each room in colours of their own."""
-    things = {t.id: t for t in world.things}
+    """Return the world with three objects of each room in colours of their own."""
+    objects = {t.id: t for t in world.objects}
     for room in rooms:
-        loose = [k for k in room.things if things[k].structure is None]
+        loose = [k for k in room.objects if objects[k].structure is None]
         for k in rng.permutation(len(loose))[:3]:
-            thing = things[loose[k]]
+            obj = objects[loose[k]]
             low, high = (_rgb(rng), _rgb(rng))
-            paint = replace(thing.parts[0].material, color=low, accent=high, seed=int(rng.integers(1 << 16)))
-            things[thing.id] = replace(thing, parts=tuple(replace(p, material=paint) for p in thing.parts))
-    return replace(world, things=tuple(things[t.id] for t in world.things))
+            paint = replace(obj.parts[0].material, color=low, accent=high, seed=int(rng.integers(1 << 16)))
+            objects[obj.id] = replace(obj, parts=tuple(replace(p, material=paint) for p in obj.parts))
+    return replace(world, objects=tuple(objects[t.id] for t in world.objects))
 
 
 def _rgb(rng: np.random.Generator) -> tuple[int, int, int]:
@@ -155,43 +155,43 @@ def _near(director: Director, room: PlacedRoom, view: View) -> View:
 
 
 def _rearranged(world: SimulatedWorld, room: PlacedRoom, rng: np.random.Generator, floor: bool) -> SimulatedWorld:
-    """Return the world with half of what stands on furniture, and on the `floor`, of a room put elsewhere in it."""
-    things = {t.id: t for t in world.things}
-    floors = [k for k in room.things if things[k].structure == "floor"]
-    for k in room.things:
-        thing = things[k]
-        loose = thing.structure is None and thing.attached is None and thing.container is None
-        if not loose or thing.label in _STAYS or rng.random() >= 0.5:
+    """Return the world with half of the objects on a room's furniture and `floor` moved within it."""
+    objects = {t.id: t for t in world.objects}
+    floors = [k for k in room.objects if objects[k].structure == "floor"]
+    for k in room.objects:
+        obj = objects[k]
+        loose = obj.structure is None and obj.attached is None and obj.container is None
+        if not loose or obj.label in _STAYS or rng.random() >= 0.5:
             continue
-        on_floor = thing.support is None or thing.support in floors
+        on_floor = obj.support is None or obj.support in floors
         if on_floor and not floor:
             continue
-        carried = [t for t in things.values() if k in (t.support, t.container)]
-        carried += [t for t in things.values() if t.container in {c.id for c in carried}]
-        moved = _elsewhere(thing, things, room, on_floor, rng)
+        carried = [t for t in objects.values() if k in (t.support, t.container)]
+        carried += [t for t in objects.values() if t.container in {c.id for c in carried}]
+        moved = _elsewhere(obj, objects, room, on_floor, rng)
         if moved is None:
             continue
-        for t in (*carried, thing):
-            things[t.id] = _with(t, thing, moved)
-    return replace(world, things=tuple(things[t.id] for t in world.things))
+        for t in (*carried, obj):
+            objects[t.id] = _with(t, obj, moved)
+    return replace(world, objects=tuple(objects[t.id] for t in world.objects))
 
 
 def _elsewhere(
-    thing: SimulatedThing, things: dict[int, SimulatedThing], room: PlacedRoom, floor: bool, rng: np.random.Generator
-) -> SimulatedThing | None:
-    """Return the thing at a free place of the room's floor or of what it stands on, None where there is none."""
-    base = None if floor or thing.support is None else things[thing.support].box()
+    obj: SimulatedObject, objects: dict[int, SimulatedObject], room: PlacedRoom, floor: bool, rng: np.random.Generator
+) -> SimulatedObject | None:
+    """Return the object at a free place of the room's floor or of its support, None where there is none."""
+    base = None if floor or obj.support is None else objects[obj.support].box()
     rivals = [
         t.box()
-        for t in (things[k] for k in room.things)
-        if t.structure is None and t.id != thing.id and t.support == thing.support and t.container is None
+        for t in (objects[k] for k in room.objects)
+        if t.structure is None and t.id != obj.id and t.support == obj.support and t.container is None
     ]
     for _ in range(60):
         if base is None:
             x, y = rng.uniform((room.x0 + 0.35, room.y0 + 0.35), (room.x1 - 0.35, room.y1 - 0.35))
         else:
             x, y = (base.center + base.rotation @ (rng.uniform(-0.4, 0.4, 3) * base.size))[:2]
-        tried = replace(thing, position=(float(x), float(y), thing.position[2]), yaw=float(rng.uniform(0, 2 * np.pi)))
+        tried = replace(obj, position=(float(x), float(y), obj.position[2]), yaw=float(rng.uniform(0, 2 * np.pi)))
         corners = tried.box().corners()[:, :2]
         low, high = corners.min(axis=0), corners.max(axis=0)
         inside = bool(
@@ -202,13 +202,13 @@ def _elsewhere(
     return None
 
 
-def _with(thing: SimulatedThing, before: SimulatedThing, after: SimulatedThing) -> SimulatedThing:
-    """Return a thing that is carried by one that was put elsewhere."""
+def _with(obj: SimulatedObject, before: SimulatedObject, after: SimulatedObject) -> SimulatedObject:
+    """Return an object moved with its support."""
     turn = after.yaw - before.yaw
     c, s = float(np.cos(turn)), float(np.sin(turn))
-    dx, dy = thing.position[0] - before.position[0], thing.position[1] - before.position[1]
+    dx, dy = obj.position[0] - before.position[0], obj.position[1] - before.position[1]
     x, y = after.position[0] + c * dx - s * dy, after.position[1] + s * dx + c * dy
-    return replace(thing, position=(x, y, thing.position[2]), yaw=thing.yaw + turn)
+    return replace(obj, position=(x, y, obj.position[2]), yaw=obj.yaw + turn)
 
 
 def _cast(preset: str, seed: int, take: Take, later: SimulatedWorld | None, size: tuple[int, int]) -> SimulatedVideo:
@@ -217,14 +217,14 @@ def _cast(preset: str, seed: int, take: Take, later: SimulatedWorld | None, size
     depth = np.empty((len(poses), camera.height, camera.width), np.float32)
     ids = np.empty(depth.shape, np.int32)
     other = _other_camera(camera, seed) if preset == "seasons" else None
-    casters = Caster(world.things, camera), Caster((later or world).things, other or camera)
+    casters = Caster(world.objects, camera), Caster((later or world).objects, other or camera)
     for k, pose in enumerate(poses):
         depth[k], ids[k] = casters[int(k >= cut)].cast(pose)
     light = (np.arange(len(poses)) >= cut).astype(np.int64) if preset in _LIT else None
-    looks = appearance_classes(world.things)
+    classes = appearance_classes(world.objects)
     time_s = np.arange(len(poses)) / take.path.fps
     return SimulatedVideo(
-        preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), looks, light, later, other
+        preset, seed, world, camera, time_s, poses, depth, ids, (cut,), (), classes, light, later, other
     )
 
 

@@ -1,4 +1,4 @@
-"""Furnished rooms of several kinds, each in its own coordinates, so that one room can stand in a building twice."""
+"""Furnished rooms of several kinds, each in its own coordinates, so that one room can be in a building twice."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from benchmarks.simulation.furnisher import (
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, wall_paint
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 
 
-def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[SimulatedThing, ...]:
-    """All things of a room in its own coordinates: x from 0 to width, y from 0 to depth; ids from 1, the floor first.
+def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[SimulatedObject, ...]:
+    """All objects of a room in its own coordinates: x from 0 to width, y from 0 to depth; ids from 1, the floor first.
 
-    Colours, sizes and places are drawn from the placer's generator; its list of things must be empty.
+    Colours, sizes and places are drawn from the placer's generator; its list of objects must be empty.
     """
-    assert not p.things
+    assert not p.objects
     walls = _shell(p, plan)
     clear = []
     for door in plan.doors:
@@ -41,7 +41,7 @@ def make_room(p: Placer, plan: RoomPlan, catalogue: Catalogue) -> tuple[Simulate
             p.add(HERE, "door frame", _frame(p), x, y, yaw, attached=walls[door.side])
     furnisher = Furnisher(p, plan, catalogue, clear, walls)
     KINDS[plan.kind](furnisher)
-    return tuple(p.things)
+    return tuple(p.objects)
 
 
 def _shell(p: Placer, plan: RoomPlan) -> dict[str, int]:
@@ -89,7 +89,7 @@ def _wall(plan: RoomPlan, side: str, openings: list[float], paint: Material) -> 
 
 
 def _frame(p: Placer) -> f.Parts:
-    """Posts and lintel about an opening, of which half the wall's thickness is this room's."""
+    """Posts and lintel about an opening, in this room's half of the wall."""
     trim, wide, deep = p.wood(0.7), DOOR_WIDTH_M, HALF_WALL_M + 0.02
     y = -HALF_WALL_M / 2 + 0.01
     posts = [f.block((0.07, deep, DOOR_HEIGHT_M), (s * (wide / 2 + 0.02), y, DOOR_HEIGHT_M / 2), trim) for s in (-1, 1)]
@@ -175,7 +175,7 @@ def _storage(g: Furnisher) -> None:
 
 
 def _empty(g: Furnisher) -> None:
-    """Two or three things in a bare room."""
+    """Two or three objects in a bare room."""
     low = groups.cabinet_group("cabinet", 0.9, 0.44, 0.8, "box")
     known = (groups.plant_group, groups.bench_group, groups.armchair_group, groups.basket_group, groups.cartons_group)
     choice = [*known, low]

@@ -1,4 +1,4 @@
-"""Ways through a building: where one can walk, where the camera goes and what it looks at."""
+"""Ways through a building: free space, path and targets of the camera."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from scipy.sparse.csgraph import dijkstra
 
 from benchmarks.simulation.buildings import Building, PlacedRoom
 from list3r.simulation.walk import PathSettings, walk_duration
-from list3r.simulation.worlds.things import SimulatedThing, stack_solids
+from list3r.simulation.worlds.objects import SimulatedObject, stack_solids
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]
 
 _CELL_M = 0.1
 _BODY_M = (0.3, 1.9)
-"""What stands between these heights is in the way."""
+"""Objects between these heights are obstacles."""
 _THROUGH_FURNITURE = 60.0
 """Cost of a metre through furniture, against 1 in the open: taken only where nothing else is left."""
 _COMFORT_M = 0.3
@@ -37,8 +37,8 @@ class FreeMap:
         high = np.array([max(r.x1 for r in rooms), max(r.y1 for r in rooms)]) + 0.5
         self._origin = low
         shape = tuple(np.ceil((high - low) / _CELL_M).astype(int)[::-1])
-        walls = [t for t in building.world.things if t.structure == "wall"]
-        others = [t for t in building.world.things if t.structure is None]
+        walls = [t for t in building.world.objects if t.structure == "wall"]
+        others = [t for t in building.world.objects if t.structure is None]
         floor = np.zeros(shape, np.uint8)
         for room in rooms:
             self._fill(
@@ -47,7 +47,7 @@ class FreeMap:
         passage = cv2.dilate(floor, np.ones((3, 3), np.uint8)).astype(bool)
         solid = self._occupied(walls, shape) | ~passage
         self.clearance_m = distance_transform_edt(~(solid | self._occupied(others, shape))) * _CELL_M
-        """Distance from each cell to what is in the way, metres. Shape (rows along y, columns along x)."""
+        """Distance from each cell to the nearest obstacle, metres. Shape (rows along y, columns along x)."""
         cost = 1 + 6 * np.exp(-((self.clearance_m / _COMFORT_M) ** 2)) + (self.clearance_m <= 0) * _THROUGH_FURNITURE
         self._graph, self._passable = _grid_graph(np.where(solid, np.inf, cost)), ~solid
         self._near_wall = cv2.dilate(solid.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
@@ -56,9 +56,9 @@ class FreeMap:
         hull = cv2.convexHull(((corners - self._origin) / _CELL_M - 0.5).astype(np.float32))
         cv2.fillConvexPoly(image, np.rint(hull * 16).astype(np.int32), 1, shift=4)
 
-    def _occupied(self, things: list[SimulatedThing], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def _occupied(self, objects: list[SimulatedObject], shape: tuple[int, ...]) -> NDArray[np.bool_]:
         image = np.zeros(shape, np.uint8)
-        for box in stack_solids(things).corners() if things else ():
+        for box in stack_solids(objects).corners() if objects else ():
             if box[:, 2].max() > _BODY_M[0] and box[:, 2].min() < _BODY_M[1]:
                 self._fill(image, box[::2, :2])
         return image.astype(bool)
@@ -69,7 +69,7 @@ class FreeMap:
         return np.clip(cell, 0, np.array(self.clearance_m.shape) - 1)
 
     def clearance(self, xy: Array) -> Array:
-        """Distance from places (N, 2) to what is in the way, metres. Shape (N,)."""
+        """Distance from places (N, 2) to the nearest obstacle, metres. Shape (N,)."""
         cell = self.cells(xy)
         return np.asarray(self.clearance_m[cell[..., 0], cell[..., 1]])
 
@@ -132,7 +132,7 @@ def _grid_graph(cost: Array) -> csr_array:
 
 @dataclass(frozen=True)
 class View:
-    """A place to stand and what to look at from there, world, metres."""
+    """A place and the targets of the camera there, world, metres."""
 
     xy: tuple[float, float]
     targets: tuple[tuple[float, float, float], ...]
@@ -140,7 +140,7 @@ class View:
 
 @dataclass
 class Director:
-    """Tells the camera where to go and where to look, and notes it as stops."""
+    """Plans the camera's path and targets, as stops."""
 
     building: Building
     free: FreeMap
@@ -158,7 +158,7 @@ class Director:
         return np.array(self.stops[-1].eye[:2])
 
     def plan_views(self, room: PlacedRoom, count: int, sweep_deg: float = 170.0, apart_m: float = 1.2) -> list[View]:
-        """Places in a room, apart from each other, with sweeps over what stands there."""
+        """Separate places in a room, with sweeps over its objects."""
         places = self.free.open_places(room, 0.45)
         chosen: list[Array] = []
         views = []
@@ -172,7 +172,7 @@ class Director:
         return views
 
     def _view(self, room: PlacedRoom, xy: Array, sweep_deg: float) -> View:
-        """A sweep from a place: of several that are drawn the one that looks farthest into the room."""
+        """A sweep from a place: the one with the longest view of several drawn ones."""
         points = self._targets(room)
         away = np.linalg.norm(points[:, :2] - xy, axis=1)
         points = points[away > min(1.0, float(np.sort(away)[-2]) - 1e-9)]
@@ -191,10 +191,10 @@ class Director:
         return View(_pair(xy), tuple(_triple(points[k]) for k in best))
 
     def _targets(self, room: PlacedRoom) -> Array:
-        """What there is to look at in a room: its things, and its corners. Shape (N, 3)."""
-        wanted = set(room.things)
-        things = [t.box() for t in self.building.world.things if t.id in wanted and t.structure is None]
-        points = [box.center for box in things if box.center[2] < 1.7 and box.size.max() > 0.3]
+        """Targets in a room: its objects, and its corners. Shape (N, 3)."""
+        wanted = set(room.objects)
+        objects = [t.box() for t in self.building.world.objects if t.id in wanted and t.structure is None]
+        points = [box.center for box in objects if box.center[2] < 1.7 and box.size.max() > 0.3]
         corners = [np.array([x, y, 0.8]) for x in (room.x0, room.x1) for y in (room.y0, room.y1)]
         return np.array([np.array([p[0], p[1], 0.35 + 0.55 * p[2]]) for p in points] + corners)
 
@@ -203,7 +203,7 @@ class Director:
         self.stops.append(Stop((*xy, self.eye_m), target))
 
     def walk_to(self, xy: tuple[float, float], *, look_round: float = 0.35) -> None:
-        """Walk along a free way and look ahead, now and then aside by up to 50 degrees."""
+        """Walk along a free way, facing ahead and now and then sideways by up to 50 degrees."""
         way = self.free.path(self.at(), np.array(xy))
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
         count = max(2, round(along[-1] / _STEP_M) + 1)
@@ -223,7 +223,7 @@ class Director:
             self.stops.append(Stop((*_pair(here), self.eye_m), (*_pair(ahead), self.eye_m - 0.45)))
 
     def look(self, view: View) -> None:
-        """Stand and look at a view's targets one after another, with a small step between them."""
+        """Turn to a view's targets one after another, with a small step between them."""
         here = np.array(view.xy)
         for target in view.targets:
             step = here + self.rng.uniform(-0.15, 0.15, 2)
@@ -232,7 +232,7 @@ class Director:
             self.stops.append(Stop((*_pair(here), self.eye_m), target))
 
     def film(self, views: list[View], *, look_round: float = 0.35) -> None:
-        """Walk from view to view and look at each."""
+        """Walk from view to view."""
         for view in views:
             if self.stops:
                 self.walk_to(view.xy, look_round=look_round)
@@ -240,7 +240,7 @@ class Director:
 
 
 def _spread(turn: Array, sweep: float) -> list[int]:
-    """Which of the directions `turn` (N,), radians, lie within a sweep and at least 18 degrees apart; two or more."""
+    """Which of the directions `turn` (N,), radians, are within a sweep and at least 18 degrees apart; two or more."""
     picked: list[int] = []
     order = [int(k) for k in np.argsort(turn, kind="stable")]
     for k in order:

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from benchmarks.simulation.buildings import Building
 from benchmarks.simulation.routes import Director, FreeMap
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.worlds.things import MovingThing
+from list3r.simulation.worlds.objects import MovingObject
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A video without pictures: where the camera is in every frame and what stands and moves there."""
+    """A video without pictures: the camera's poses, the building and the movers."""
 
     preset: str
     seed: int
@@ -28,7 +28,7 @@ class Shot:
     """Shape (F, 4, 4)."""
     cuts: tuple[int, ...]
     """Frames before which the camera jumps."""
-    movers: tuple[MovingThing, ...] = ()
+    movers: tuple[MovingObject, ...] = ()
 
 
 @dataclass

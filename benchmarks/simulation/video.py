@@ -1,4 +1,4 @@
-"""What a perfect observer knows of a simulated video: the border between worlds and simulated models."""
+"""Full truth of a simulated video: the interface between worlds and simulated models."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from list3r.simulation.worlds.world import SimulatedWorld
 
 @dataclass(frozen=True)
 class MoverTruth:
-    """A thing that moves while it is filmed."""
+    """An object that moves while it is filmed."""
 
     id: int
     """Its id in `SimulatedVideo.ids`."""
@@ -37,16 +37,16 @@ class SimulatedVideo:
     depth: NDArray[np.float32]
     """Along the camera's z, metres, 0 where nothing is hit. Shape (F, H, W)."""
     ids: NDArray[np.int32]
-    """Id of the thing in every pixel, 0 for nothing. Shape (F, H, W)."""
+    """Id of the object in every pixel, 0 for nothing. Shape (F, H, W)."""
     cuts: tuple[int, ...]
     """Frames before which the camera jumps."""
     movers: tuple[MoverTruth, ...]
-    looks: dict[int, int]
-    """Class of appearance of each thing: two things of one class look alike (twins)."""
+    classes: dict[int, int]
+    """Class of appearance of each object: two objects of one class are twins."""
     light: NDArray[np.int64] | None = None
     """Which light each frame was filmed in; None where it is all the same. Shape (F,)."""
     later: SimulatedWorld | None = None
-    """The world after the first cut, where things were moved in between."""
+    """The world after the first cut, where objects were moved in between."""
     later_camera: Camera | None = None
     """The camera after the first cut, of the same picture size, where it is another one."""
 
@@ -61,7 +61,7 @@ class SimulatedVideo:
     def points(
         self, frames: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return where the pixels of frames (N,) lie in the world, metres; the camera's place where nothing is hit.
+        """Return where the pixels of frames (N,) are in the world, metres; the camera's place where nothing is hit.
 
         Shape (N, 3).
         """

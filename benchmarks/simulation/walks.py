@@ -15,7 +15,7 @@ from benchmarks.simulation.returns import film_return
 from benchmarks.simulation.takes import Shot, Take
 from list3r.memory.errors import OptionError
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.worlds.things import MovingThing, SimulatedThing
+from list3r.simulation.worlds.objects import MovingObject, SimulatedObject
 from list3r.simulation.worlds.truth import rounded
 from list3r.simulation.worlds.world import SimulatedWorld
 
@@ -33,9 +33,8 @@ class ChangedWalk(WalkSettings):
 
 @dataclass(frozen=True)
 class PresetWalk(WalkSettings):
-    """A building, a way through it and what moves there, by name (see `presets`).
-
-    `seed` decides them; `path` and `walk_seed` are left aside, and the walk is never slowed.
+    """A building, a way through it and its movers, by name (see `presets`). `seed` decides them; `path` and `walk_seed`
+    are unused, and the walk is never slowed.
     """
 
     preset: str = "calm"
@@ -48,8 +47,8 @@ class PresetWalk(WalkSettings):
         """Seconds (F,) and T_world_cam (F, 4, 4) of the frames to be written."""
         return self._shot().time_s[self._span()], self._shot().T_world_cam[self._span()]
 
-    def movers(self) -> tuple[MovingThing, ...]:
-        """What moves while it is filmed, with its pose in each of the frames to be written."""
+    def movers(self) -> tuple[MovingObject, ...]:
+        """The moving objects, with their poses in the frames to be written."""
         return tuple(replace(m, T_world_object=m.T_world_object[self._span()]) for m in self._shot().movers)
 
     def cuts(self) -> tuple[int, ...]:
@@ -59,7 +58,7 @@ class PresetWalk(WalkSettings):
 
     def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
         """The content of `truth.json`, with the cuts and the movers with their places over time."""
-        movers = [_mover_truth(m.thing, m.T_world_object, seen.get(m.thing.id, {})) for m in self.movers()]
+        movers = [_mover_truth(m.obj, m.T_world_object, seen.get(m.obj.id, {})) for m in self.movers()]
         return super().truth(seen) | {"preset": self.preset, "cuts": list(self.cuts()), "movers": movers}
 
     def _shot(self) -> Shot:
@@ -75,8 +74,7 @@ class PresetWalk(WalkSettings):
 @dataclass(frozen=True)
 class SeenAgainWalk(WalkSettings):
     """The end of the first run and the whole second run of `benchmarks.simulation.returns`, where nothing was moved.
-
-    `seed` decides both; `path` and `walk_seed` are left aside.
+    `seed` decides both; `path` and `walk_seed` are unused.
     """
 
     preset: str = "opposite"
@@ -100,9 +98,8 @@ class SeenAgainWalk(WalkSettings):
 
 @dataclass(frozen=True)
 class HomeSessionWalk(WalkSettings):
-    """One of two sessions in a room of a home, between which half of what can be moved was (`moved` of `returns`).
-
-    `seed` decides the home and both ways; `path` and `walk_seed` are left aside.
+    """One of two sessions in a room of a home; half of its movable objects are moved in between (`moved` of `returns`).
+    `seed` decides the home and both ways; `path` and `walk_seed` are unused.
     """
 
     second: bool = False
@@ -132,16 +129,16 @@ def _shot(preset: str, seed: int) -> Shot:
     return make_shot(preset, seed)
 
 
-def _mover_truth(thing: SimulatedThing, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
-    """What `truth.json` says of a thing that moves: its size and, for each frame, the middle of its base and its yaw.
+def _mover_truth(obj: SimulatedObject, T_world_object: NDArray[np.float64], seen: dict[str, int]) -> dict[str, Any]:
+    """Entry of a moving object in `truth.json`: its size and, for each frame, the middle of its base and its yaw.
 
-    `thing` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
+    `obj` is at the origin, `T_world_object` (F, 4, 4) upright, metres.
     """
     yaw = np.arctan2(T_world_object[:, 1, 0], T_world_object[:, 0, 0])
     return {
-        "id": thing.id,
-        "label": thing.label,
-        "size": rounded(thing.box().size),
+        "id": obj.id,
+        "label": obj.label,
+        "size": rounded(obj.box().size),
         "position": [rounded(p) for p in T_world_object[:, :3, 3]],
         "yaw": rounded(yaw),
         "frames_seen": seen.get("frames", 0),

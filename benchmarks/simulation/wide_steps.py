@@ -17,7 +17,7 @@ from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import SimulatedWorld
 
 _DENSE = PathSettings(fps=60.0, speed_m_s=0.5, turn_deg_s=30.0)
-"""The walk of which frames are picked."""
+"""The walk that frames are picked from."""
 _ROOMS = (0, 0, 1, 0, 1)
 """Rooms in the order in which they are entered, again and again; a room is filmed from a new place each time."""
 _SWEEP_DEG = 60.0
@@ -29,9 +29,8 @@ _DRAWN_IN_S = 0.5
 
 @dataclass(frozen=True)
 class WideStepWalk(WalkSettings):
-    """A walk to and fro between the two rooms of a building, of which a frame is kept after each step.
-
-    `frames` is its length, which must be given; `path` and `walk_seed` are left aside.
+    """A walk to and fro between the two rooms of a building, with a frame after each step. `frames` is its length,
+    which must be given; `path` and `walk_seed` are unused.
     """
 
     step_m: float = 0.08
@@ -39,9 +38,8 @@ class WideStepWalk(WalkSettings):
     step_deg: float = 4.0
     """or turned so far, whichever comes first."""
     clear_m: float = 0.3
-    """The camera is not held nearer than this to what stands in the way, where the body is not nearer itself. Without
-    it and with steps of 6 degrees walks are those of research/colour-video 0074, which touch door frames
-    (research/colour-video 0075)."""
+    """Least distance of the camera to an obstacle, unless the body is nearer itself. Without it and with steps of 6
+    degrees walks are those of research/colour-video 0074, which touch door frames (research/colour-video 0075)."""
 
     def world(self) -> SimulatedWorld:
         """The world of the building."""
@@ -77,7 +75,7 @@ def _filmed(
 
 
 def _held(T_world_body: NDArray[np.float64], free: FreeMap, clear_m: float) -> NDArray[np.float64]:
-    """Poses (F, 4, 4) of a camera that is held before a body that looks where the camera looks."""
+    """Poses (F, 4, 4) of a camera held before a body that faces the same way."""
     T = T_world_body.copy()
     level = T[:, :2, 2] / np.linalg.norm(T[:, :2, 2], axis=1, keepdims=True)
     least = np.minimum(free.clearance(T[:, :2, 3]), clear_m)

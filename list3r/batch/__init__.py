@@ -1,1 +1,1 @@
-"""Many videos, many memories: a task for each video, engines that place tasks, a manifest of what is done."""
+"""Many videos, many memories: a task for each video, engines that place tasks, a manifest of their states."""

@@ -1,7 +1,7 @@
-"""The manifest of a batch: a row for each task with its state, in one SQLite file beside the memories.
+"""The manifest of a batch: a row for each task with its state, in one SQLite file next to the memories.
 
-It tells what is going on and spares looking at what is done. It is no proof: that is the published file, which names
-the tasks that are in it, so a manifest that was lost is written again without building anything twice.
+It shows progress and avoids checks of finished tasks. The proof is the published file, which names its tasks: a lost
+manifest is written again without building anything twice.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _APPLICATION_ID = 0x4C334231
 
 @dataclass(frozen=True)
 class TaskRow:
-    """What is known of one task."""
+    """State of one task."""
 
     memory: str
     source: str
@@ -90,9 +90,8 @@ class Ledger:
         self._lock.release()
 
     def begin(self, tasks: Sequence[BatchTask]) -> dict[BatchTask, TaskRow]:
-        """Return the row of each task: that of before where source and settings are the same, else a fresh one.
-
-        What ran when a batch was killed is pending again.
+        """Return the row of each task: the earlier one where source and settings are the same, else a new one. Tasks
+        that ran when a batch was killed are pending again.
         """
         with self._transaction():
             self._release()
@@ -106,7 +105,7 @@ class Ledger:
         return {t: rows[t.memory, t.source] for t in tasks}
 
     def _release(self) -> None:
-        """Make pending what nobody works on any more."""
+        """Make tasks without a worker pending."""
         self._database.execute("UPDATE tasks SET state = 'pending' WHERE state = 'running'")
         self._database.execute(
             "UPDATE attempts SET outcome = 'lost', reason = 'the batch was ended' "

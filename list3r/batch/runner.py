@@ -1,4 +1,4 @@
-"""A batch: the tasks that are not done are handed to an engine, and what becomes of them is written down."""
+"""A batch: unfinished tasks are handed to an engine, and their outcomes are recorded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from list3r.memory.errors import OptionError
 from list3r.memory.records import JsonFields
 
 STATE = "batch.sqlite"
-"""Name of the manifest beside the memories."""
+"""Name of the manifest next to the memories."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class BatchSettings:
     out: str
     """Folder or URL of the memories."""
     scratch: Path | None = None
-    """Folder on each machine's own disk for what is under way; None: `.work` in a local `out`, else in the system's
+    """Folder on each machine's own disk for unfinished files; None: `.work` in a local `out`, else in the system's
     folder for temporary files."""
     state: Path | None = None
     """The manifest; None: in a local `out`."""
     retries: int = 3
-    """How often a task is tried again whose process was ended from outside."""
+    """Retries of a task whose process was ended from outside."""
     workers: int = 0
-    """Processes of a task beside the one that runs it."""
+    """Processes of a task besides the one that runs it."""
     onto: bool = False
     force: bool = False
 
@@ -74,7 +74,7 @@ class BatchSettings:
 
 @dataclass(frozen=True)
 class BatchReport(JsonFields):
-    """What a run of a batch did."""
+    """Result of a run of a batch."""
 
     done: int
     """Tasks that are done now."""
@@ -85,19 +85,19 @@ class BatchReport(JsonFields):
 
 
 OnOutcome = Callable[[Outcome, int, int], None]
-"""Called with how an attempt ended, the tasks that are settled, and all."""
+"""Called with the outcome of an attempt, the number of finished tasks, and of all."""
 
 
 def run_batch(
     groups: Sequence[Sequence[BatchTask]],
     engine: Engine,
     settings: BatchSettings,
-    on_outcome: OnOutcome = lambda outcome, settled, total: None,
+    on_outcome: OnOutcome = lambda outcome, finished, total: None,
 ) -> BatchReport:
     """Do the tasks that are not done yet; tasks of one memory one after the other, others side by side.
 
     A task that fails leaves the others alone. When the batch is interrupted its tasks end at once and are pending; the
-    same call goes on with them. Raises `OptionError` and `MemoryFileError` for what concerns all tasks.
+    same call goes on with them. Raises `OptionError` and `MemoryFileError` for errors that concern all tasks.
     """
     try:
         Output(settings.out).prepare()
@@ -111,9 +111,9 @@ def run_here(group: Sequence[BatchTask], settings: BatchSettings, on_outcome: On
     """Do the tasks of one memory in this process, without a manifest: what an element of an array job does."""
     Output(settings.out).prepare()
     outcomes = []
-    for settled, job in enumerate(settings.jobs([group])[0], 1):
+    for finished, job in enumerate(settings.jobs([group])[0], 1):
         outcomes.append(run_task(job))
-        on_outcome(outcomes[-1], settled, len(group))
+        on_outcome(outcomes[-1], finished, len(group))
     done = [o for o in outcomes if o.state == "done"]
     return BatchReport(len(done), sum(o.built for o in done), len(outcomes) - len(done), [_row(o) for o in outcomes])
 
@@ -133,7 +133,7 @@ class _Run:
         self._waiting: deque[deque[BatchJob]] = deque()
         self._under_way: dict[str, deque[BatchJob]] = {}
         self._lost: dict[str, int] = {}
-        self._settled = self._built = self._total = 0
+        self._finished = self._built = self._total = 0
 
     def run(self, groups: Sequence[Sequence[BatchTask]]) -> BatchReport:
         tasks = [t for group in groups for t in group]
@@ -142,7 +142,7 @@ class _Run:
         there = {m: output.size(m) is not None for m in {t.memory for t in tasks if rows[t].state == "done"}}
         for jobs in self._settings.jobs(groups):
             left = deque(j for j in jobs if rows[j.task].state != "done" or not there[j.task.memory])
-            self._settled += len(jobs) - len(left)
+            self._finished += len(jobs) - len(left)
             if left:
                 self._waiting.append(left)
         self._total = len(tasks)
@@ -173,8 +173,8 @@ class _Run:
         self._ledger.ended(outcome, "pending" if again else "done" if outcome.state == "done" else "failed")
         if not again:
             jobs.popleft()
-            self._settled += 1
+            self._finished += 1
             self._built += outcome.built
-        self._on_outcome(outcome, self._settled, self._total)
+        self._on_outcome(outcome, self._finished, self._total)
         if jobs:
             self._waiting.appendleft(jobs)

@@ -15,14 +15,14 @@ from list3r.memory.store.file import connected, file_hash, fold_in
 from list3r.memory.store.store import Store
 
 BATCH_KEYS = Fact[tuple[str, ...]]("batch_keys", tuple[str, ...], ())
-"""Keys of the tasks of a batch whose videos are in a memory, in their order."""
+"""Keys of the batch tasks contained in a memory, in their order."""
 
 
 def seal(memory: Path, sealed: Path, keys: Sequence[str], source: str) -> str:
     """Write a finished memory to `sealed`; return the SHA-256 of the file.
 
-    What tells runs apart is left out: the seconds that stages took, where a fetched video lay (`source` is named
-    instead, for the last session), and how SQLite laid out its pages. Raises `MemoryFileError`.
+    Differences between runs are left out: durations of stages, the path of a fetched video (`source` is named instead,
+    for the last session), and SQLite's page layout. Raises `MemoryFileError`.
     """
     with Store.open(memory, writable=True) as store, store.transaction():
         store.chunks.forget_seconds()
@@ -48,6 +48,6 @@ def seal(memory: Path, sealed: Path, keys: Sequence[str], source: str) -> str:
 
 
 def batch_keys(memory: Path) -> tuple[str, ...]:
-    """Return the keys of the tasks whose videos are in a published memory. Raises `MemoryFileError`."""
+    """Return the keys of the tasks contained in a published memory. Raises `MemoryFileError`."""
     with Store.open(memory) as store:
         return store.facts[BATCH_KEYS]

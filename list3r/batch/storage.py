@@ -16,14 +16,14 @@ _NAME = re.compile(r"[\w][\w.-]{0,99}")
 
 
 def checked_name(name: str) -> str:
-    """Return the name of a memory, of which paths are made. Raises `OptionError` for one that could lead elsewhere."""
+    """Return a memory's name, which becomes part of paths. Raises `OptionError` for one that could lead elsewhere."""
     if not _NAME.fullmatch(name):
         raise OptionError(f"{name!r} cannot be the name of a memory; use letters, digits, - and _")
     return name
 
 
 def is_remote(where: str) -> bool:
-    """Tell a URL such as s3://bucket/walk.mp4 from a path."""
+    """Return whether it is a URL such as s3://bucket/walk.mp4, not a path."""
     return "://" in where
 
 
@@ -72,7 +72,7 @@ def read_text(where: str) -> str:
 
 
 def fetched(source: str, folder: Path) -> Path:
-    """Return a source on this machine's disk: copied into `folder` where it lies elsewhere. Raises `SourceError`."""
+    """Return a source on this machine's disk: copied into `folder` where it is elsewhere. Raises `SourceError`."""
     if not is_remote(source):
         return Path(source)
     fs, path = _filesystem(source)
@@ -97,7 +97,7 @@ class Output:
         self._remote = is_remote(where)
 
     def place(self, name: str) -> str:
-        """Return where a memory lies."""
+        """Return where a memory is."""
         return joined(self._where, f"{name}.l3r")
 
     def prepare(self) -> None:

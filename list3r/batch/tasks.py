@@ -1,4 +1,4 @@
-"""What a batch is asked to do: a task for each video, read from a manifest or found in a folder."""
+"""The tasks of a batch: one for each video, read from a manifest or found in a folder."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ class BatchTask:
 
     @property
     def key(self) -> str:
-        """Return what names this piece of work: 32 hexadecimal digits."""
+        """Return the key of this task: 32 hexadecimal digits."""
         return _hashed([self.memory, self.source_hash or self.source, self.settings_hash])
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked for of every video of a batch."""
+    """Options for every video of a batch."""
 
     options_of: Callable[[Mapping[str, Any]], SourceOptions]
-    """What is known of a source, from the fields of its line in the manifest; raises `TypeError` for one unknown."""
+    """Options of a source, from the fields of its line in the manifest; raises `TypeError` for one unknown."""
     request: BuildRequest = field(default_factory=BuildRequest)
     run: RunOptions = field(default_factory=RunOptions)
 
@@ -78,7 +78,7 @@ def read_tasks(where: str, asked: Asked) -> list[list[BatchTask]]:
 
 
 def _lines(where: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the videos with where each stands, as fields."""
+    """Yield the videos with their paths, as fields."""
     if (is_remote(where) and not PurePosixPath(where).suffix) or (not is_remote(where) and Path(where).is_dir()):
         for name, is_folder in children(where):
             if not name.startswith(".") and (is_folder or PurePosixPath(name).suffix.lower() in _VIDEOS):
@@ -124,7 +124,7 @@ def _task(at: str, fields: dict[str, Any], asked: Asked) -> BatchTask:
 
 
 def _shaping(run: RunOptions) -> list[str]:
-    """Return what of the options of a run shapes the memory."""
+    """Return the options of a run that affect the memory."""
     return [run.licence, str(run.scale_anchor), str(run.detector), str(run.detector_classes)]
 
 

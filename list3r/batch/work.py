@@ -1,8 +1,8 @@
-"""One task, in whatever process or machine it was placed: fetch, build or update, seal, publish.
+"""One task, in any process or machine: fetch, build or update, seal, publish.
 
-The file under way lies on the machine's own disk under a name of the task's key, and is the checkpoint: a task that
-was killed goes on with the chunks that are in it. What is published names the tasks that are in it, so one that was
-killed after publishing is known to be done.
+The file under way is on the machine's own disk under a name of the task's key, and is the checkpoint: a task that was
+killed goes on with the chunks that are in it. A published file names its tasks, so one killed after publishing is known
+to be done.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class BatchJob:
     siblings: tuple[str, ...] = ()
     """Keys of all tasks of the same memory."""
     workers: int = 0
-    """Processes beside the one that runs the task."""
+    """Processes besides the one that runs the task."""
     onto: bool = False
     """Whether the video may be added to a memory that no batch made."""
     force: bool = False
@@ -69,7 +69,7 @@ class Outcome:
 
 
 def run_task(job: BatchJob) -> Outcome:
-    """Do one task; return how it ended. Never raises for what is wrong with one video."""
+    """Do one task; return how it ended. Never raises for errors of one video."""
     started = time.monotonic()
     where = f"{socket.gethostname()}:{os.getpid()}"
     try:
@@ -104,9 +104,8 @@ def _done(job: BatchJob) -> Outcome:
 
 
 def _published(job: BatchJob, output: Output, copy: Path) -> tuple[tuple[str, ...], bool]:
-    """Copy the memory that is published, where one is; return the keys of what is in it, and whether to add to it.
-
-    Raises `MemoryFileError` for one that this task may neither add to nor replace.
+    """Copy the published memory, if any; return the keys of its tasks, and whether to add to it. Raises
+    `MemoryFileError` for one that this task may neither extend nor replace.
     """
     remove_memory(copy)
     if output.size(job.task.memory) is None:
@@ -132,7 +131,7 @@ class _Known:
 
 
 def _worked(job: BatchJob, work: Path, before: Path | None) -> BuildReport | UpdateReport | _Known:
-    """Build the file under way, or update what was published `before`, or go on with either."""
+    """Build the file under way, or update the file published `before`, or resume either."""
     task = job.task
     known = _finished(work, before)
     if known is not None and task.run.scale_anchor is None and task.run.detector is None:
@@ -151,7 +150,7 @@ def _worked(job: BatchJob, work: Path, before: Path | None) -> BuildReport | Upd
 
 
 def _finished(work: Path, before: Path | None) -> _Known | None:
-    """Return what the file under way holds where all of the video is in it; None where something is left to do."""
+    """Return the content of the file under way if the whole video is in it; None where work is left."""
     if not work.exists():
         return None
     known = 0

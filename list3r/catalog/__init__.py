@@ -1,4 +1,4 @@
-"""One catalogue of many memories: which files there are, and an index of what is in them, rebuilt from the files."""
+"""One catalogue of many memories: a list of files and an index of their content, rebuilt from the files."""
 
 from list3r.catalog.catalog import Catalog
 

@@ -1,4 +1,4 @@
-"""What a database of a catalogue does, and which one a URL means."""
+"""Interface of a catalogue's database, and the database of a URL."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.catalog.records import CatalogFilters, CatalogThing, MemoryContent, MemoryEntry, Wanted
+from list3r.catalog.records import CatalogFilters, CatalogInstance, MemoryContent, MemoryEntry, Wanted
 
 MOST_RANKED = 2_000
 """Most instances that match some words and are ranked; of more, any of them."""
@@ -19,9 +19,8 @@ class Backend(Protocol):
     """A database that holds a catalogue. Each call sees one state of it. Raises `CatalogError`."""
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name; of the same file only when it is asked for `again`.
-
-        Return its entry, whose revision is the next one where the file is another.
+        """Write a memory in place of the one with its name; the same file only with `again`. Return its entry, with the
+        next revision where the file differs.
         """
         ...
 
@@ -34,16 +33,16 @@ class Backend(Protocol):
         ...
 
     def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
-        """Return entries by name, all or those of some names."""
+        """Return entries by name, all or some."""
         ...
 
-    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+    def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
         """Return one instance."""
         ...
 
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and its k instances whose axis-aligned boxes are nearest to a point, the nearest first.
 
         None where there is no memory of that name.
@@ -52,13 +51,13 @@ class Backend(Protocol):
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and its instances whose axis-aligned boxes meet a box; None where there is no such memory."""
         ...
 
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+    ) -> tuple[list[tuple[CatalogInstance, float]], int]:
         """Return the k that are wanted with how well the words name them, the best first, and how many were ranked."""
         ...
 
@@ -82,8 +81,8 @@ class Backend(Protocol):
 
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
-    ) -> list[tuple[CatalogThing, float]]:
-        """Return the k whose vectors are most like one of length 1, with the cosine, the most alike first."""
+    ) -> list[tuple[CatalogInstance, float]]:
+        """Return the k instances with the highest cosine to a unit vector, the most similar first."""
         ...
 
     def alive(self) -> bool:
@@ -100,9 +99,9 @@ def wanted_sql(
 ) -> tuple[str, list[Any]]:
     """Return the condition (with `?` for values) that an instance is wanted, and its values.
 
-    `words` makes the condition of having words, of an alias and the words. Relations are looked up for each that has
-    the words: OFFSET keeps PostgreSQL from joining them instead, which takes minutes in one memory where it has no
-    statistics yet. Over all memories joining them is many times faster, from the end that fewer have: `joined`.
+    `words` makes the condition of having words, of an alias and the words. Relations are looked up for each instance
+    with the words: OFFSET keeps PostgreSQL from a join, which takes minutes in one memory without statistics. Over all
+    memories a join from the rarer end is many times faster: `joined`.
     """
     parts, values = ["TRUE"], []
     if wanted.words:

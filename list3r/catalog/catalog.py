@@ -20,9 +20,9 @@ from list3r.catalog.records import (
     CatalogAnswers,
     CatalogError,
     CatalogFilters,
+    CatalogInstance,
     CatalogMatch,
     CatalogRelation,
-    CatalogThing,
     MemoryEntry,
     UnknownMemoryError,
     Wanted,
@@ -82,10 +82,11 @@ class Catalog:
     # ------------------------------------------------------------------ memories
 
     def add(self, path: str | Path, name: str | None = None, store: str | None = None) -> MemoryEntry:
-        """Take a memory file into the catalogue, in place of what has its name; its entry, with the new revision.
+        """Add a memory file to the catalogue, in place of the one with its name; returns its entry, with the new
+        revision.
 
         With a `store`, a folder or URL, the file is copied there under a name that no other file ever gets, and the
-        catalogue names the copy. Raises `OptionError` for what cannot be a name, `CatalogError`, `MemoryFileError`.
+        catalogue names the copy. Raises `OptionError` for an invalid name, `CatalogError`, `MemoryFileError`.
         """
         content = read_content(str(path), name)
         if store is not None:
@@ -138,7 +139,7 @@ class Catalog:
         k: int = 5,
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
-        """Find the k things of one memory nearest to a point or to the centre of an instance, by their boxes."""
+        """Find the k instances of one memory nearest to a point or to the centre of an instance, by their boxes."""
         k, filters = _count(k), filters or CatalogFilters()
         if (point is None) == (instance_id is None):
             raise OptionError("give either a point or an instance")
@@ -147,7 +148,7 @@ class Catalog:
         while True:
             entry, near = _of(memory, self._backend.near(printable(memory), at.tolist(), count, filters))
             found = [f for f in _by_distance(near, at) if f[1] != own][:k]
-            # Axis-aligned boxes bound the distance from below: what was not looked at is no nearer than the last.
+            # Axis-aligned boxes bound the distance from below: other instances are no nearer than the last.
             if len(near) < count or (len(found) == k and found[-1][0] <= near[-1].aabb_distance(at)):
                 break
             count *= 4
@@ -164,7 +165,7 @@ class Catalog:
         radius: float | None = None,
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
-        """Find the things of one memory whose boxes meet a box or a sphere, those nearest to its middle first."""
+        """Find the instances of one memory whose boxes meet a box or a sphere, those nearest to its middle first."""
         filters = filters or CatalogFilters()
         box, sphere = lower is not None and upper is not None, center is not None and radius is not None
         if box == sphere:
@@ -174,7 +175,7 @@ class Catalog:
             low, high = checked_point(lower, "lower corner"), checked_point(upper, "upper corner")
             middle, reach = (low + high) / 2.0, np.inf
             if (low > high).any():
-                raise OptionError(f"the lower corner {low.tolist()} must not lie beyond the upper one {high.tolist()}")
+                raise OptionError(f"the lower corner {low.tolist()} must not be beyond the upper one {high.tolist()}")
         else:
             assert center is not None and radius is not None
             middle, reach = checked_point(center, "center"), checked_length(radius, "radius")
@@ -182,7 +183,7 @@ class Catalog:
         region = low.tolist(), high.tolist()
         entry, met = _of(memory, self._backend.inside(printable(memory), *region, filters, MOST_ANSWERS + 1))
         found = _by_distance(met, middle)
-        notes = [f"more than {MOST_ANSWERS} things are there; only these are listed"] if len(met) > MOST_ANSWERS else []
+        notes = [f"only the first {MOST_ANSWERS} instances are listed"] if len(met) > MOST_ANSWERS else []
         rows = (
             (t, 1.0 / (1.0 + d), d, f"box {d:.2f} from the middle") for d, _, t in found[:MOST_ANSWERS] if d <= reach
         )
@@ -197,7 +198,7 @@ class Catalog:
         """
         k, filters, entries = _count(k), filters or CatalogFilters(), self._entries(memory)
         question = parse(text)
-        best: dict[tuple[str, int], tuple[CatalogThing, float, None, str]] = {}
+        best: dict[tuple[str, int], tuple[CatalogInstance, float, None, str]] = {}
         total, notes, fits = 0, list(question.notes), []
         for phrase in question.phrases:
             found, ranked = self._named(memory, phrase, k, filters)
@@ -217,10 +218,10 @@ class Catalog:
 
     def _named(
         self, memory: str | None, phrase: Phrase, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogThing, float, str]], int]:
+    ) -> tuple[list[tuple[CatalogInstance, float, str]], int]:
         """Return the k best that a phrase means, by the first of its nouns that names any, and how many there are."""
         for nouns in tiers(phrase):
-            found: dict[tuple[str, int], tuple[CatalogThing, float, str]] = {}
+            found: dict[tuple[str, int], tuple[CatalogInstance, float, str]] = {}
             total = 0
             for noun in nouns or (None,):
                 wanted = _wanted(phrase, noun)
@@ -246,7 +247,7 @@ class Catalog:
         k: int = 5,
         filters: CatalogFilters | None = None,
     ) -> CatalogAnswers:
-        """Find things that look like an instance of a memory, or like a vector of a space: over all memories, or in
+        """Find instances that look like an instance of a memory, or like a vector of a space: over all memories, or in
         that one alone where not `anywhere`.
 
         Raises `OptionError` for arguments that make no sense, `SpaceMismatchError` for vectors of another space.
@@ -305,19 +306,19 @@ class Catalog:
     def _entries(self, memory: str | None) -> list[MemoryEntry]:
         return [] if memory is None else [self.memory(memory)]
 
-    def _known(self, memory: str, instance_id: int | None) -> CatalogThing:
+    def _known(self, memory: str, instance_id: int | None) -> CatalogInstance:
         assert instance_id is not None
         found, name = None, printable(memory)
         if 0 <= instance_id <= _LARGEST_ID:
-            found = self._backend.thing(name, instance_id)
+            found = self._backend.instance(name, instance_id)
             if found is None:  # there is no such memory, or it was taken in again since it was last asked for
-                found = self._backend.thing(self.memory(name).name, instance_id)
+                found = self._backend.instance(self.memory(name).name, instance_id)
         if found is None:
             raise UnknownIdError(f"the catalogue has no instance {instance_id} in {memory}")
         return found
 
     def _end(self, what: int | str | None, memory: str | None) -> Wanted:
-        """Return what a subject or an object stands for."""
+        """Return the instances meant by a subject or an object."""
         if what is None:
             return Wanted()
         if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,18}", what):
@@ -357,7 +358,7 @@ class Catalog:
 
     def _answers(
         self,
-        rows: Iterable[tuple[CatalogThing, float, float | None, str]],
+        rows: Iterable[tuple[CatalogInstance, float, float | None, str]],
         known: Sequence[MemoryEntry],
         notes: Sequence[str] = (),
     ) -> CatalogAnswers:
@@ -369,8 +370,10 @@ class Catalog:
         return CatalogAnswers(found, [*notes, *notices])
 
 
-def _of(name: str, found: tuple[MemoryEntry, list[CatalogThing]] | None) -> tuple[MemoryEntry, list[CatalogThing]]:
-    """Return what a database found in a memory. Raises `UnknownMemoryError` where there is none of that name."""
+def _of(
+    name: str, found: tuple[MemoryEntry, list[CatalogInstance]] | None
+) -> tuple[MemoryEntry, list[CatalogInstance]]:
+    """Return the result of a database for a memory. Raises `UnknownMemoryError` where it has none of that name."""
     if found is None:
         raise _unknown(name)
     return found
@@ -381,7 +384,7 @@ def _unknown(name: str) -> UnknownMemoryError:
 
 
 def is_stale(entry: MemoryEntry) -> bool | None:
-    """Tell whether a file is another one than the catalogue knows; None for one that does not lie on this machine."""
+    """Return whether a file differs from the catalogued one; None for one that is not on this machine."""
     if is_remote(entry.path) or not entry.mtime_ns:
         return None
     try:
@@ -391,21 +394,23 @@ def is_stale(entry: MemoryEntry) -> bool | None:
     return (now.st_size, now.st_mtime_ns) != (entry.bytes, entry.mtime_ns)
 
 
-def box_distances(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_distances(instances: Sequence[CatalogInstance], point: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distances of a point from oriented boxes, 0 inside, world units. Shape (N,)."""
-    apart = point - np.array([t.box.center for t in things]).reshape(-1, 3)
-    axes, size = (np.array([getattr(t.box, name) for t in things]) for name in ("rotation", "size"))
+    apart = point - np.array([t.box.center for t in instances]).reshape(-1, 3)
+    axes, size = (np.array([getattr(t.box, name) for t in instances]) for name in ("rotation", "size"))
     local = np.einsum("ni,nij->nj", apart, axes.reshape(-1, 3, 3))
     return np.asarray(np.linalg.norm(np.maximum(np.abs(local) - size.reshape(-1, 3) / 2.0, 0.0), axis=1))
 
 
-def _by_distance(things: Sequence[CatalogThing], point: NDArray[np.float64]) -> list[tuple[float, int, CatalogThing]]:
-    """Return things with the distance of a point from their boxes and their number, the nearest first."""
-    held = zip(box_distances(things, point).tolist(), things, strict=True)
+def _by_distance(
+    instances: Sequence[CatalogInstance], point: NDArray[np.float64]
+) -> list[tuple[float, int, CatalogInstance]]:
+    """Return instances with the distance of a point from their boxes and their number, the nearest first."""
+    held = zip(box_distances(instances, point).tolist(), instances, strict=True)
     return sorted(((d, t.id, t) for d, t in held), key=lambda f: f[:2])
 
 
-def _match(t: CatalogThing, entry: MemoryEntry, stale: bool | None, found: Sequence[Any]) -> CatalogMatch:
+def _match(t: CatalogInstance, entry: MemoryEntry, stale: bool | None, found: Sequence[Any]) -> CatalogMatch:
     score, distance, reason = found
     return CatalogMatch(
         t.memory,

@@ -20,23 +20,23 @@ from list3r.catalog.postgres_schema import MIGRATIONS, lists_of, vector_index, v
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
-    CatalogThing,
+    CatalogInstance,
     MemoryContent,
     MemoryEntry,
     SpaceVectors,
     Wanted,
 )
-from list3r.catalog.sqlite import check_dimension, thing_of
+from list3r.catalog.sqlite import check_dimension, instance_of
 from list3r.memory.search.vectors import unit
 
 _ENTRY_FIELDS = fields(MemoryEntry)
 _ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)
 _OF_ONE = "i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
-_THING = f"m.name, {_OF_ONE}"
+_INSTANCE = f"m.name, {_OF_ONE}"
 _BUILD_MEMORY = "2GB"
-"""What the server may take while it makes an index of vectors."""
+"""Memory of the server while it makes an index of vectors."""
 _MOST_ALIKE = 10_000
-"""Vectors that are looked at because few of the most alike pass the filters."""
+"""Vectors scanned at most when few of the most similar pass the filters."""
 _WIDE, _LISTS_OF_WIDE = 128, 20
 """Vectors with more numbers than the first are searched in as many lists as the second says, instead of 40: they take
 longer to compare, and fewer lists find as many. research/storage 0141."""
@@ -59,7 +59,7 @@ class PostgresBackend:
     # ------------------------------------------------------------------ writing
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name, in one transaction."""
+        """Write a memory in place of the one with its name, in one transaction."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
             names, marks = ", ".join(f.name for f in _ENTRY_FIELDS), ", ".join("%s" for _ in _ENTRY_FIELDS)
@@ -79,7 +79,7 @@ class PostgresBackend:
             )
             if known.revision:
                 self._forget(connection, memory)
-            _copy_things(connection, memory, content)
+            _copy_instances(connection, memory, content)
             for space, held in spaces:
                 _copy_vectors(connection, memory, space, held)
             return entry
@@ -146,34 +146,35 @@ class PostgresBackend:
         self._numbers |= {str(name): int(number) for number, name, *_ in rows}
         return [MemoryEntry(*row[1:]) for row in rows]
 
-    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+    def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
         """Return one instance."""
         query = f"SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ? AND i.id = ?"
         rows = self._rows(query, (self._number(memory), instance_id))
-        return _thing((memory, *rows[0])) if rows else None
+        return _instance((memory, *rows[0])) if rows else None
 
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and the k nearest by axis-aligned boxes, through the index of boxes."""
         passing, values = filters_sql(filters, "i")
         return self._placed(memory, f"{passing} ORDER BY i.bounds <-> ?::cube LIMIT ?", [*values, _corner(point), k])
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and its instances whose axis-aligned boxes meet a box."""
         passing, values = filters_sql(filters, "i")
         region = f"{_corner(lower)},{_corner(upper)}"
         given = [region, *values, None if limit < 0 else limit]
         return self._placed(memory, f"i.bounds && ?::cube AND {passing} ORDER BY i.id LIMIT ?", given)
 
-    def _placed(self, memory: str, which: str, values: Sequence[Any]) -> tuple[MemoryEntry, list[CatalogThing]] | None:
-        """Return a memory and those of its instances that a condition tells, by one way to the server.
-
-        With the known number of the memory the plan reads one partition; if it is gone, it is looked up again. It is
-        passed with the type of the column: psycopg sends small numbers as `smallint`, which the index of (memory, box)
-        does not compare, so that it would be gone through over all memories of the partition.
+    def _placed(
+        self, memory: str, which: str, values: Sequence[Any]
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
+        """Return a memory and its instances that meet a condition, in one round trip. With the known number of the
+        memory the plan reads one partition; if it is gone, it is looked up again. It is passed with the type of the
+        column: psycopg sends small numbers as `smallint`, for which the index of (memory, box) is scanned over all
+        memories of the partition.
         """
         chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ?::integer AND {which}) i"
         query = f"SELECT {_ENTRY}, i.* FROM memory m LEFT JOIN {chosen} ON TRUE WHERE m.memory_id = ?"
@@ -182,14 +183,14 @@ class PostgresBackend:
             rows = self._rows(query, (number, *values, number)) if number else []
             if rows:
                 entry = MemoryEntry(*rows[0][: len(_ENTRY_FIELDS)])
-                of_things = (row[len(_ENTRY_FIELDS) :] for row in rows)
-                return entry, [_thing((memory, *row)) for row in of_things if row[0] is not None]
+                of_instances = (row[len(_ENTRY_FIELDS) :] for row in rows)
+                return entry, [_instance((memory, *row)) for row in of_instances if row[0] is not None]
             self._numbers.pop(memory, None)
         return None
 
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+    ) -> tuple[list[tuple[CatalogInstance, float]], int]:
         """Return the k that are wanted with how well the words name them."""
         a, values = wanted_sql(wanted, "i", _bearing, joined=memory is None)
         b, more = filters_sql(filters, "i")
@@ -197,12 +198,12 @@ class PostgresBackend:
         weight = "(SELECT avg(w.n) FROM unnest(i.words, i.weights) w (word, n) WHERE w.word = ANY(?))"
         query = (
             f"WITH chosen AS MATERIALIZED (SELECT i.* FROM instance i WHERE {a} AND {b}{only} LIMIT {MOST_RANKED}) "
-            f"SELECT {_THING}, coalesce({weight}, 100) AS weight, (SELECT count(*) FROM chosen) "
+            f"SELECT {_INSTANCE}, coalesce({weight}, 100) AS weight, (SELECT count(*) FROM chosen) "
             "FROM chosen i JOIN memory m USING (memory_id) "
             "ORDER BY weight DESC, i.confidence DESC, m.name, i.id LIMIT ?"
         )
         rows = self._rows(query, (*values, *more, *given, list(wanted.words), k))
-        return [(_thing(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
+        return [(_instance(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
 
     def related(
         self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
@@ -255,11 +256,9 @@ class PostgresBackend:
 
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
-    ) -> list[tuple[CatalogThing, float]]:
-        """Return the k most alike: in one memory exactly, over all through the index of vectors.
-
-        Of vectors that are equally alike those of the first names and ids come, so that an answer does not depend on
-        the order in which memories were written.
+    ) -> list[tuple[CatalogInstance, float]]:
+        """Return the k most similar: exact in one memory, over all through the index of vectors. Ties are ordered by
+        name and id, so that an answer does not depend on the order in which memories were written.
         """
         asked, count = _halfvec(vector), k
         only, apart = "", "v <=> ?::halfvec"
@@ -279,15 +278,15 @@ class PostgresBackend:
                 return sorted(out, key=lambda f: (-f[1], f[0].memory, f[0].id))[:k]
             count = min(4 * count, _MOST_ALIKE)
 
-    def _passing(self, ids: Sequence[Any], filters: CatalogFilters) -> dict[tuple[int, int], CatalogThing]:
-        """Return those of some instances that pass the filters, by memory and id."""
+    def _passing(self, ids: Sequence[Any], filters: CatalogFilters) -> dict[tuple[int, int], CatalogInstance]:
+        """Return the given instances that pass the filters, by memory and id."""
         passing, values = filters_sql(filters, "i")
         query = (
-            f"SELECT {_THING}, i.memory_id FROM unnest(?::integer[], ?::bigint[]) a (memory_id, id) "
+            f"SELECT {_INSTANCE}, i.memory_id FROM unnest(?::integer[], ?::bigint[]) a (memory_id, id) "
             f"JOIN instance i USING (memory_id, id) JOIN memory m USING (memory_id) WHERE {passing}"
         )
         rows = self._rows(query, ([n for n, _ in ids], [i for _, i in ids], *values))
-        return {(int(row[-1]), int(row[1])): _thing(row[:-1]) for row in rows}
+        return {(int(row[-1]), int(row[1])): _instance(row[:-1]) for row in rows}
 
     def _number(self, memory: str) -> int:
         """Return the number that a memory had when it was last asked for, 0 where there is none of that name.
@@ -349,7 +348,7 @@ class PostgresBackend:
 
 
 def _lost(error: psycopg.Error) -> bool:
-    """Whether the connection was lost, so that nobody knows whether a transaction that was ending has ended."""
+    """Whether the connection was lost, so that the end of a running transaction is unknown."""
     return isinstance(error, psycopg.OperationalError) and (error.sqlstate or "08").startswith(("57P", "08"))
 
 
@@ -370,7 +369,7 @@ def _checked(url: str) -> str:
 
 
 def _first_line(error: Exception) -> str:
-    """Return in one line what the server or the library says."""
+    """Return the message of the server or the library in one line."""
     text = getattr(getattr(error, "diag", None), "message_primary", None) or str(error).strip() or type(error).__name__
     return str(text).splitlines()[0]
 
@@ -433,10 +432,10 @@ def _keep_index(connection: psycopg.Connection[Any], space: int) -> None:
             connection.execute("SELECT pg_advisory_unlock(%s, %s)", lock)
 
 
-def _copy_things(connection: psycopg.Connection[Any], memory: int, content: MemoryContent) -> None:
+def _copy_instances(connection: psycopg.Connection[Any], memory: int, content: MemoryContent) -> None:
     with connection.cursor() as cursor:
         with cursor.copy("COPY instance FROM STDIN") as copy:
-            for t in content.things:
+            for t in content.instances:
                 bounds = ",".join(map(_corner, t.bounds()))
                 values = (t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component)
                 words = list(t.words), list(t.words.values())
@@ -472,7 +471,7 @@ def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
 
 
 def _marked(query: str) -> bytes:
-    """Return a query with the marks of values that this database takes. What is given never stands in its text."""
+    """Return a query with this database's placeholders. Values are never part of its text."""
     return query.replace("?", "%s").encode()
 
 
@@ -480,5 +479,5 @@ def _first(cursor: psycopg.Cursor[Any]) -> Any:
     return cursor.fetchone() or ()
 
 
-def _thing(row: Sequence[Any]) -> CatalogThing:
-    return thing_of(row, np.array(row[9], np.float64))
+def _instance(row: Sequence[Any]) -> CatalogInstance:
+    return instance_of(row, np.array(row[9], np.float64))

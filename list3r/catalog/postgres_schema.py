@@ -44,7 +44,7 @@ MIGRATIONS: tuple[str, ...] = (
         space_id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, name text NOT NULL UNIQUE,
         dimension integer NOT NULL);
     """,
-    # Vectors lie in lists since; the next load makes their index.
+    # Vectors are in lists since; the next load makes their index.
     """
     DO $$ DECLARE old text; BEGIN
         FOR old IN SELECT indexname FROM pg_indexes WHERE schemaname = 'list3r' AND indexname ~ '^vector_[0-9]+_alike$'

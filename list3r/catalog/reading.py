@@ -1,4 +1,4 @@
-"""Read what a catalogue takes from a memory file."""
+"""Read a memory file for a catalogue."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from list3r.batch.storage import checked_name, fetched, is_remote
-from list3r.catalog.records import CatalogError, CatalogThing, MemoryContent, MemoryEntry, SpaceVectors
+from list3r.catalog.records import CatalogError, CatalogInstance, MemoryContent, MemoryEntry, SpaceVectors
 from list3r.memory.description.words import vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
@@ -18,8 +18,8 @@ from list3r.memory.store.store import Store
 def read_content(path: str, name: str | None = None) -> MemoryContent:
     """Return the content of a memory file, under its own name unless another is given.
 
-    Raises `OptionError` for what cannot be a name, `MemoryFileError` for what is no memory, `CatalogError` for one that
-    is being written.
+    Raises `OptionError` for an invalid name, `MemoryFileError` for no memory, `CatalogError` for one that is being
+    written.
     """
     if path != printable(path):
         raise CatalogError(f"{printable(path)} is not valid UTF-8, which a catalogue needs; rename the file or folder")
@@ -41,7 +41,7 @@ def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryC
         )
     name = _own_name(path) if name is None else checked_name(name)
     with Store.open(local) as store, store.snapshot():
-        things = [_thing(name, i) for i in store.instances.all()]
+        instances = [_instance(name, i) for i in store.instances.all()]
         relations = [
             (r.subject, r.predicate, r.object, float(r.confidence), float(r.margin)) for r in store.relations.all()
         ]
@@ -55,10 +55,10 @@ def _content(local: Path, path: str, mtime_ns: int, name: str | None) -> MemoryC
             mtime_ns,
             store.facts.scale_kind or "relative",
             store.facts.gravity,
-            sum(t.structure is None for t in things),
+            sum(t.structure is None for t in instances),
             len(store.sessions.all()),
         )
-    return MemoryContent(entry, things, relations, spaces)
+    return MemoryContent(entry, instances, relations, spaces)
 
 
 def _own_name(path: str) -> str:
@@ -68,9 +68,9 @@ def _own_name(path: str) -> str:
         raise OptionError(f"{path}: {error}; rename the file, or add it under another name") from None
 
 
-def _thing(memory: str, i: Instance) -> CatalogThing:
+def _instance(memory: str, i: Instance) -> CatalogInstance:
     known = vocabulary(i.label, i.structure, i.description, i.color_name)
-    return CatalogThing(
+    return CatalogInstance(
         memory,
         i.id,
         None if i.label is None else printable(i.label),
@@ -86,5 +86,5 @@ def _thing(memory: str, i: Instance) -> CatalogThing:
 
 
 def printable(text: str) -> str:
-    """Return a text without what a database cannot hold: NUL, and halves of characters."""
+    """Return a text without characters that a database cannot hold: NUL and lone surrogates."""
     return text.replace("\x00", "\ufffd").encode("utf-8", "replace").decode("utf-8")

@@ -1,4 +1,4 @@
-"""What a catalogue holds and answers."""
+"""Records and answers of a catalogue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from list3r.queries.match import STATES
 
 
 class CatalogError(List3rError):
-    """A catalogue that cannot be reached, read or written, or does not hold what is asked for."""
+    """A catalogue that cannot be reached, read or written, or lacks the requested content."""
 
 
 class UnknownMemoryError(CatalogError):
@@ -49,8 +49,8 @@ class MemoryEntry:
 
 
 @dataclass(frozen=True)
-class CatalogThing:
-    """What the catalogue keeps of an instance."""
+class CatalogInstance:
+    """An instance in the catalogue."""
 
     memory: str
     id: int
@@ -97,7 +97,7 @@ class MemoryContent:
     """All that the catalogue takes from a memory file."""
 
     entry: MemoryEntry
-    things: list[CatalogThing]
+    instances: list[CatalogInstance]
     relations: list[tuple[int, str, int, float, float]]
     """Subject, predicate, object, confidence, margin."""
     spaces: list[SpaceVectors]
@@ -120,13 +120,13 @@ class CatalogFilters:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Instances that a question asks for: by words or an id, and how they stand to others."""
+    """Instances that a question asks for: by words or an id, and by relations."""
 
     words: tuple[str, ...] = ()
-    """All of which it must have."""
+    """Words that it must have, all."""
     instance_id: int | None = None
     where: tuple[tuple[tuple[str, ...], Wanted], ...] = ()
-    """Predicates, of which one must hold, and the object."""
+    """Alternative predicates, and the object."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class CatalogMatch:
     revision: int
     path: str
     stale: bool | None
-    """Whether the file is another one by now; None where that was not looked at."""
+    """Whether the file has changed since; None where unchecked."""
     id: int
     label: str | None
     description: str
@@ -170,7 +170,7 @@ class CatalogRelation:
 
 
 class CatalogAnswers(list[Any]):
-    """Answers, the best first, with what can be said of the question as a whole."""
+    """Answers, the best first, with notes on the question as a whole."""
 
     def __init__(self, found: Iterable[Any] = (), notes: Sequence[str] = ()) -> None:
         super().__init__(found)

@@ -17,7 +17,7 @@ from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
-    CatalogThing,
+    CatalogInstance,
     MemoryContent,
     MemoryEntry,
     SpaceVectors,
@@ -52,12 +52,12 @@ CREATE TABLE IF NOT EXISTS vector (
     PRIMARY KEY (space, memory_id, id)) WITHOUT ROWID;
 """
 _ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
-_THING = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
+_INSTANCE = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _FROM = "FROM instance i JOIN memory m ON m.memory_id = i.memory_id"
 _OF_MEMORY = "i.memory_id = (SELECT memory_id FROM memory WHERE name = ?)"
 _BATCH = 20_000
 _GROW = 2.0
-"""How much further is looked where too little lies within a distance."""
+"""Factor by which a search distance grows when it finds too few."""
 
 
 class SqliteBackend:
@@ -84,7 +84,7 @@ class SqliteBackend:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of what has its name."""
+        """Write a memory in place of the one with its name."""
         with self._writing():
             known = self.memories([content.entry.name])
             before = known[0] if known else content.entry
@@ -103,15 +103,15 @@ class SqliteBackend:
     def _write(self, memory: int, content: MemoryContent) -> None:
         database = self._database
         first = int(database.execute("SELECT coalesce(max(number), 0) + 1 FROM instance").fetchone()[0])
-        things = list(enumerate(content.things, first))
+        numbered = list(enumerate(content.instances, first))
         marks = ", ".join("?" for _ in range(11))
-        rows = ((n, memory, *_columns_of(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in things)
+        rows = ((n, memory, *_columns_of(t), np.array(t.box_numbers(), "<f4").tobytes()) for n, t in numbered)
         database.executemany(f"INSERT INTO instance VALUES ({marks})", rows)
-        boxes = ((n, *(v for pair in zip(*t.bounds(), strict=True) for v in pair), memory, memory) for n, t in things)
+        boxes = ((n, *(v for pair in zip(*t.bounds(), strict=True) for v in pair), memory, memory) for n, t in numbered)
         database.executemany("INSERT INTO bounds VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", boxes)
         database.executemany(
             "INSERT INTO word VALUES (?, ?, ?)",
-            sorted((w, n, weight) for n, t in things for w, weight in t.words.items()),
+            sorted((w, n, weight) for n, t in numbered for w, weight in t.words.items()),
         )
         database.executemany(
             "INSERT INTO relation VALUES (?, ?, ?, ?, ?, ?)", ((memory, *r) for r in content.relations)
@@ -156,20 +156,20 @@ class SqliteBackend:
             ]
         return [MemoryEntry(*row) for row in rows]
 
-    def thing(self, memory: str, instance_id: int) -> CatalogThing | None:
+    def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
         """Return one instance."""
-        rows = self._rows(f"SELECT {_THING} {_FROM} WHERE {_OF_MEMORY} AND i.id = ?", (memory, instance_id))
-        return _thing(rows[0]) if rows else None
+        rows = self._rows(f"SELECT {_INSTANCE} {_FROM} WHERE {_OF_MEMORY} AND i.id = ?", (memory, instance_id))
+        return _instance(rows[0]) if rows else None
 
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and the k nearest by axis-aligned boxes."""
         entry = self.memories([memory])
         return (entry[0], self._near(memory, np.asarray(point, np.float64), k, filters)) if entry else None
 
-    def _near(self, memory: str, at: NDArray[np.float64], k: int, filters: CatalogFilters) -> list[CatalogThing]:
-        """Return the k nearest: of those within a distance that grows until they are enough."""
+    def _near(self, memory: str, at: NDArray[np.float64], k: int, filters: CatalogFilters) -> list[CatalogInstance]:
+        """Return the k nearest, within a distance that grows until it holds enough."""
         reach, farthest = 1.0, np.inf
         while True:
             found = self._inside(memory, (at - reach).tolist(), (at + reach).tolist(), filters, -1)
@@ -194,30 +194,30 @@ class SqliteBackend:
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> tuple[MemoryEntry, list[CatalogThing]] | None:
+    ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
         """Return a memory and its instances whose axis-aligned boxes meet a box."""
         entry = self.memories([memory])
         return (entry[0], self._inside(memory, lower, upper, filters, limit)) if entry else None
 
     def _inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
-    ) -> list[CatalogThing]:
+    ) -> list[CatalogInstance]:
         """Return instances whose axis-aligned boxes meet a box; all with a negative limit."""
         passing, values = filters_sql(filters, "i")
         low, high = lower, upper
         query = (
-            f"SELECT {_THING} FROM bounds b JOIN instance i ON i.number = b.number JOIN memory m USING (memory_id) "
+            f"SELECT {_INSTANCE} FROM bounds b JOIN instance i ON i.number = b.number JOIN memory m USING (memory_id) "
             "WHERE b.min_memory <= (SELECT memory_id FROM memory WHERE name = ?) "
             "AND b.max_memory >= (SELECT memory_id FROM memory WHERE name = ?) "
             "AND b.max_x >= ? AND b.min_x <= ? AND b.max_y >= ? AND b.min_y <= ? AND b.max_z >= ? AND b.min_z <= ? "
             f"AND {passing} ORDER BY i.id LIMIT ?"
         )
         ends = [v for pair in zip(low, high, strict=True) for v in pair]
-        return [_thing(row) for row in self._rows(query, (memory, memory, *ends, *values, limit))]
+        return [_instance(row) for row in self._rows(query, (memory, memory, *ends, *values, limit))]
 
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogThing, float]], int]:
+    ) -> tuple[list[tuple[CatalogInstance, float]], int]:
         """Return the k that are wanted with how well the words name them."""
         where, values = _where(memory, wanted, filters)
         marks = ", ".join("?" for _ in wanted.words)
@@ -226,12 +226,12 @@ class SqliteBackend:
         )
         query = (
             f"WITH chosen AS MATERIALIZED (SELECT i.number {_FROM} WHERE {where} LIMIT {MOST_RANKED}) "
-            f"SELECT {_THING}, {weight} AS weight, (SELECT count(*) FROM chosen) "
+            f"SELECT {_INSTANCE}, {weight} AS weight, (SELECT count(*) FROM chosen) "
             "FROM chosen JOIN instance i USING (number) JOIN memory m USING (memory_id) "
             "ORDER BY weight DESC, i.confidence DESC, m.name, i.id LIMIT ?"
         )
         rows = self._rows(query, (*values, *wanted.words, k))
-        return [(_thing(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
+        return [(_instance(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
 
     def related(
         self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
@@ -273,7 +273,7 @@ class SqliteBackend:
 
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
-    ) -> list[tuple[CatalogThing, float]]:
+    ) -> list[tuple[CatalogInstance, float]]:
         """Return the k most alike: all vectors are compared, so the answer is exact."""
         passing, values = filters_sql(filters, "i")
         only, given = ("", ()) if memory is None else (f" AND {_OF_MEMORY}", (memory,))
@@ -289,8 +289,8 @@ class SqliteBackend:
                 both = np.column_stack([held @ vector, [n for n, _ in some]])
                 best = np.concatenate([best, both])
                 best = best[np.lexsort((best[:, 1], -best[:, 0]))[:k]]
-            query = f"SELECT {_THING} {_FROM} WHERE i.number = ?"
-            return [(_thing(self._database.execute(query, (int(n),)).fetchone()), float(c)) for c, n in best]
+            query = f"SELECT {_INSTANCE} {_FROM} WHERE i.number = ?"
+            return [(_instance(self._database.execute(query, (int(n),)).fetchone()), float(c)) for c, n in best]
 
     def alive(self) -> bool:
         """Whether the file can be read."""
@@ -333,18 +333,18 @@ class SqliteBackend:
             raise CatalogError(f"{self._path} cannot be written: {error}; nothing was changed") from error
 
 
-def _columns_of(t: CatalogThing) -> tuple[object, ...]:
+def _columns_of(t: CatalogInstance) -> tuple[object, ...]:
     return t.id, t.label, t.description, t.state, t.structure, t.confidence, t.sigma, t.component
 
 
 def _bearing(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
-    """Over all memories: what has a word is looked up."""
+    """Over all memories: instances are looked up by word."""
     one = f"{alias}.number IN (SELECT number FROM word WHERE word = ?)"
     return " AND ".join([one] * len(words)), list(words)
 
 
 def _bearing_here(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
-    """In one memory: each of its instances is looked at."""
+    """In one memory: each of its instances is tested."""
     one = f"EXISTS (SELECT 1 FROM word WHERE word = ? AND number = {alias}.number)"
     return " AND ".join([one] * len(words)), list(words)
 
@@ -357,15 +357,15 @@ def _where(memory: str | None, wanted: Wanted, filters: CatalogFilters) -> tuple
     return f"{a} AND {b} AND {_OF_MEMORY}", [*values, *more, memory]
 
 
-def _thing(row: Sequence[Any]) -> CatalogThing:
-    return thing_of(row, np.frombuffer(row[9], "<f4").astype(np.float64))
+def _instance(row: Sequence[Any]) -> CatalogInstance:
+    return instance_of(row, np.frombuffer(row[9], "<f4").astype(np.float64))
 
 
-def thing_of(row: Sequence[Any], box: NDArray[np.float64]) -> CatalogThing:
+def instance_of(row: Sequence[Any], box: NDArray[np.float64]) -> CatalogInstance:
     """Return an instance of a row of its fields and the 15 numbers of its box."""
     memory, id, label, description, state, structure, confidence, sigma, component = row[:9]
     values = (label, description, state, structure, confidence, sigma, component)
-    return CatalogThing(memory, id, *values, box_of(box), {})
+    return CatalogInstance(memory, id, *values, box_of(box), {})
 
 
 def box_of(numbers: NDArray[np.float64]) -> OrientedBox:

@@ -38,7 +38,7 @@ def print_error(kind: str, message: str, status: int) -> None:
 
 
 def wants_json(arguments: list[str]) -> bool:
-    """Tell whether a command line asks for JSON."""
+    """Return whether a command line asks for JSON."""
     return "--json" in (arguments[: arguments.index("--")] if "--" in arguments else arguments)
 
 

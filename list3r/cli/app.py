@@ -63,7 +63,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Evaluate": ("eval",),
     "Maintain": ("verify", "repair", "doctor", "models"),
 }
-"""What commands are for, in the order of the help."""
+"""Sections of the help, in order."""
 
 
 class GroupedCommands(typer.core.TyperGroup):
@@ -89,7 +89,7 @@ _COMMAND_ERROR: type[Exception] = typer.BadParameter.__mro__[2]
 def main() -> None:
     """Run the command line and exit."""
     prepare_streams()
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what is wrong with a picture is said by us, in one line
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # errors of pictures are reported by us, in one line
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL:
             signal.signal(getattr(signal, name), _interrupt)
@@ -103,10 +103,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 @functools.cache
 def commands(asked: str | None = None) -> Any:
-    """Return the tree of all commands and their options, or of those that one of them is made with.
-
-    Making all of it takes longer than many a question.
-    """
+    """Return the tree of all commands and options, or the part for one command, as the whole takes long."""
     app = typer.Typer(
         name="list3r",
         cls=GroupedCommands,
@@ -199,14 +196,14 @@ class _Failures:
     """Whether standard output gets an answer that holds the error."""
 
     def fail(self, kind: str, message: str) -> int:
-        """Say what is wrong with the input; exit status 2."""
+        """Report an error of the input; exit status 2."""
         note(f"error: {message}")
         if self.json:
             print_error(kind, message, 2)
         return 2
 
     def fail_of_system(self, error: RuntimeError | OSError) -> int:
-        """What the system says, and links that lead to themselves, which Python calls no error of the system."""
+        """Errors of the system, and circular links, for which Python raises another error."""
         if isinstance(error, RuntimeError):
             if not str(error).startswith("Symlink loop"):
                 raise error
@@ -215,7 +212,7 @@ class _Failures:
         return self.fail("OSError", f"{where} {error.strerror or error}".strip())
 
     def fail_of_memory(self, error: MemoryError | ImportError) -> int:
-        """Memory that ran out, which libraries that are loaded tell in their own way; exit status 1."""
+        """Out of memory, which loaded libraries report in their own way; exit status 1."""
         if isinstance(error, ImportError) and "failed to map" not in str(error):
             raise error
         message = "the process ran out of memory; raise its limit (ulimit -v, or that of the container)"
@@ -223,7 +220,7 @@ class _Failures:
         return 1
 
     def usage(self, error: BaseException) -> int:
-        """What is wrong with the command line, and where its help is."""
+        """An error of the command line, and the command's help."""
         from list3r.exporters.registry import FORMATS
 
         context = error.ctx  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ from list3r.cli.terminal import ProgressBar, draws
 def progress_bar(stage: str, unit: str = "", *, quiet: bool = False) -> Iterator[ProgressBar]:
     """Show a bar on standard error while the work goes on, where that is a terminal, and take it away at the end.
 
-    What is written to standard error meanwhile stands above it. Work that tells no numbers shows how long it has taken.
+    Other output on standard error appears above it. Work without numbers shows its duration.
     """
     if quiet or not draws(sys.stderr):
         yield ProgressBar()

@@ -1,4 +1,4 @@
-"""What the commands share: how options are read and how results are shown."""
+"""Shared parts of the commands: reading of options and output of results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextvars import ContextVar
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
@@ -23,6 +22,9 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory
 
 MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memory file.", show_default=False)]
+AtOption = Annotated[
+    int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 
@@ -39,47 +41,15 @@ def parse_point(text: str, option: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-_AT: ContextVar[int | None] = ContextVar("at", default=None)
-"""The session after which the world is asked about, for the command that runs."""
-
-
-def asked_at() -> int | None:
-    """Return the session of `--at` of the command that runs."""
-    return _AT.get()
-
-
 @contextlib.contextmanager
-def open_memory(path: Path, min_confidence: float | None = None) -> Iterator[SceneMemory]:
-    """The memory behind a path, for reading: as it is, as it was after the session of `--at`, or all of it that is at
-    least so sure, scraps too.
-
-    All that is read belongs to one state, whatever a build or an update commits meanwhile.
+def open_memory(path: Path, min_confidence: float | None = None, at: int | None = None) -> Iterator[SceneMemory]:
+    """The memory of a path, for reading: now, after the session `at`, or with all segments of a least confidence.
+    All reads see one state, also while a build or an update commits.
     """
     from list3r.api import open as open_scene
 
-    with open_scene(path, at=_AT.get(), min_confidence=min_confidence) as scene, scene.store.snapshot():
+    with open_scene(path, at=at, min_confidence=min_confidence) as scene, scene.store.snapshot():
         yield scene
-
-
-def with_at(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The same command with `--at SESSION`, which `open_memory` obeys while it runs."""
-    signature = inspect.signature(command, eval_str=True)
-    option = Annotated[
-        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
-    ]
-    added = inspect.Parameter("at", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
-
-    @functools.wraps(command)
-    def asked(*args: Any, at: int | None = None, **values: Any) -> Any:
-        before = _AT.set(at)
-        try:
-            return command(*args, **values)
-        finally:
-            _AT.reset(before)
-
-    asked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
-    asked.__annotations__ = {**get_type_hints(command, include_extras=True), "at": option}
-    return asked
 
 
 def only(*names: str) -> tuple[str, ...]:
@@ -88,10 +58,9 @@ def only(*names: str) -> tuple[str, ...]:
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with one option for each field of those of its parameters that are dataclasses of options.
-
-    `source: SourceArguments` in its signature stands for all fields of `SourceArguments`, in that place and order. A
-    field that is such a dataclass itself stands for its own fields.
+    """Return the command with parameters that are dataclasses of options expanded to one option for each field.
+    `source: SourceArguments` in its signature becomes all fields of `SourceArguments`, in that place and order. A field
+    that is such a dataclass itself is expanded too.
     """
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
@@ -115,7 +84,7 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options_of(group: Any) -> list[inspect.Parameter]:
-    """Return the options that a dataclass stands for."""
+    """Return the options that a dataclass represents."""
     types = get_type_hints(group, include_extras=True)
     inner = [
         _options_of(types[f.name]) if is_dataclass(types[f.name]) else [_as_option(f, types[f.name])]
@@ -153,7 +122,7 @@ def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:
 
 
 def _choices(metavar: str) -> Callable[[], list[str]] | None:
-    """Return what a shell completes, of an option that is one of several words."""
+    """Return the completions of an option that is one of several words."""
     return metavar.split("|").copy if "|" in metavar and metavar.islower() else None
 
 
@@ -189,7 +158,5 @@ def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None
 
 
 def in_column(name: str) -> str:
-    """Return what somebody called a thing for a table: of blanks in a row, which look like the gap between columns,
-    only the first stays one.
-    """
+    """Return a name for a table: repeated blanks, which look like a gap between columns, are escaped."""
     return re.sub(r"(?<= ) +", lambda blanks: r"\x20" * len(blanks[0]), name)

@@ -1,6 +1,6 @@
-"""Tables and bars as `rich` draws them; imported only where a terminal is looked at.
+"""Tables and bars as `rich` draws them; imported only for a terminal.
 
-Cells are `Text`, never markup, and come from `shown`: what a memory or a file says is drawn and not obeyed.
+Cells are `Text`, never markup, and come from `shown`: text from a memory or a file is drawn and not obeyed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _GAP = 2
 _LEAST = 12
 """Letters that a column of words, or a bar, keeps where room is short."""
 _BAR, _WORDS = 40, 62
-"""Letters of a bar at most, and of what stands beside it."""
+"""Letters of a bar at most, and of its text."""
 
 
 def drawn_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str | None:
@@ -62,7 +62,7 @@ def _without_margin(cells: Sequence[str]) -> list[str]:
 
 @contextmanager
 def drawn_bar() -> Iterator[ProgressBar]:
-    """Draw a bar on standard error, with what is written there above it; gone at the end."""
+    """Draw a bar on standard error, below other output there; gone at the end."""
     console = Console(stderr=True, highlight=False)
     width = max(_LEAST, min(_BAR, console.width - _WORDS))
     columns = (TextColumn("{task.description}", markup=False), BarColumn(width), _Numbers(Column(no_wrap=True)))
@@ -90,7 +90,7 @@ class _DrawnBar(ProgressBar):
 
 
 class _Numbers(ProgressColumn):
-    """What is done of all, the rate since the stage began and the time left; or the time so far."""
+    """Count done, the rate since the stage began and the time left; or the time so far."""
 
     def render(self, task: Task) -> Text:
         unit = task.fields["unit"]

@@ -1,7 +1,7 @@
-"""The one way to the terminal: a line is a line, and shows what it is given without obeying it.
+"""All output to the terminal: one line each, with control characters shown instead of obeyed.
 
-Labels, reasons and names of files may come from anybody. Control characters, line ends and marks that turn
-the direction of text are shown escaped, so that nothing forges a row, moves the cursor or hides.
+Labels, reasons and names of files may come from anybody. Those, line ends and marks that turn the direction
+of text are shown escaped, so that nothing forges a row, moves the cursor or hides.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _FULL = "standard output cannot be written"
 
 
 class OutputError(List3rError):
-    """Standard output that takes no more; what was asked for is done."""
+    """Standard output that takes no more; the command itself is done."""
 
 
 def say(*lines: object) -> None:
@@ -26,27 +26,27 @@ def say(*lines: object) -> None:
 
 
 def write(text: str) -> None:
-    """Print what is made to be printed as it is, such as JSON. Raises `OutputError`."""
+    """Print text unchanged, such as JSON. Raises `OutputError`."""
     try:
         sys.stdout.write(text)
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OutputError(f"{_FULL} ({error.strerror}); what was asked for is done") from error
+        raise OutputError(f"{_FULL} ({error.strerror}); the command itself is done") from error
 
 
 def flush() -> None:
-    """See to it that what was printed is written. Raises `OutputError`."""
+    """Flush standard output. Raises `OutputError`."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OutputError(f"{_FULL} ({error.strerror}); what was asked for is done") from error
+        raise OutputError(f"{_FULL} ({error.strerror}); the command itself is done") from error
 
 
 def note(*lines: object) -> None:
-    """Print lines on standard error; where nobody listens, or nothing fits any more, that is no failure."""
+    """Print lines on standard error; failures are ignored."""
     with contextlib.suppress(OSError):
         sys.stderr.write("".join(f"{shown(line)}\n" for line in lines))
         sys.stderr.flush()
@@ -59,7 +59,7 @@ def draws(stream: object) -> bool:
 
 
 def mute() -> None:
-    """Give up standard output, so that what is left in its buffer fails nowhere."""
+    """Discard standard output, so that its buffer cannot fail later."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
@@ -81,7 +81,7 @@ def prepare_streams() -> None:
 
 
 class ProgressBar:
-    """A bar that draws nothing: work says how far it is whether or not somebody looks."""
+    """A bar that draws nothing, so that work reports progress in any case."""
 
     def stage(self, name: str, unit: str = "") -> None:
         """Begin another stage of the work, counted in `unit`; nothing of it is done yet."""

@@ -60,9 +60,9 @@ def intersection_volume(a: OrientedBox, b: OrientedBox) -> float:
 def box_overlaps(
     truth: Sequence[OrientedBox], estimate: Sequence[OrientedBox], is_round: Sequence[bool] = ()
 ) -> tuple[Array, Array]:
-    """Return IoU, and the share of each estimated box that lies in each true one. Two of shape (T, E).
+    """Return IoU, and the share of each estimated box that is in each true one. Two of shape (T, E).
 
-    A true box of which `is_round` says that its yaw means nothing is turned to that of the estimate.
+    True boxes with `is_round` have no yaw and take that of the estimate.
     """
     turns = list(is_round) or [False] * len(truth)
     shared = np.array(

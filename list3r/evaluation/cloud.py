@@ -61,11 +61,11 @@ def evaluate_cloud(
 ) -> CloudErrors:
     """Compare two clouds (M, 3) and (N, 3) of one coordinate frame, metres.
 
-    `normals` are those of the truth (M, 3) and of the estimate (N, 3), of unit length; None where they are not known.
+    `normals` are unit normals of the truth (M, 3) and of the estimate (N, 3); None where unknown.
 
     `truncate_m` caps single distances, where parts of the truth were never in view; None leaves them. `distances` are
-    those of `cloud_distances` where they are known already. Raises `OptionError` for an empty cloud, for points that
-    are not finite and for a threshold that is no length.
+    the results of `cloud_distances` if computed already. Raises `OptionError` for an empty cloud, points that are not
+    finite and a threshold that is no length.
     """
     a, b = _points(truth, "truth"), _points(estimate, "estimate")
     if not threshold_m > 0 or not (truncate_m is None or truncate_m > 0):
@@ -105,10 +105,8 @@ def cloud_distances(truth: ArrayLike, estimate: ArrayLike) -> CloudDistances:
 
 
 def near_order(points: Array) -> NDArray[np.int64]:
-    """Return rows in an order in which neighbours in space follow on one another. Shape (N,).
-
-    Trees built and asked in that order find what they need in the processor's cache: three times as fast for a million
-    points.
+    """Return rows in an order that keeps neighbours in space together. Shape (N,). Trees built and queried in that
+    order use the processor's cache: three times as fast for a million points.
     """
     low = points.min(axis=0)
     cell = max(float(np.max(points.max(axis=0) - low)) / 200, 1e-12)

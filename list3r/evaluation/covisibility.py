@@ -1,8 +1,8 @@
 """Which frames see the same surface: covisibility from true poses and depth.
 
-`share[i, j]` is the part of the surface seen in frame i that frame j sees too (SuperGlue's overlap score, Sarlin et
-al. 2020, before its mean over both directions). It is kept directed: a close look at a table top lies wholly inside a
-wide view of the room, while the wide view shares little with the close look.
+`share[i, j]` is the part of the surface seen in frame i that frame j sees too (SuperGlue's overlap score, Sarlin et al.
+2020, before its mean over both directions). It is kept directed: a close look at a table top is wholly inside a wide
+view of the room, while the wide view shares little with the close look.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class CovisibilitySettings:
     """How surfaces are compared."""
 
     points: int = 600
-    """Surface points of a frame that are looked for in the others, on a regular grid: a share is good to 2 %."""
+    """Surface points of a frame that are projected into the others, on a regular grid: a share is good to 2 %."""
     tolerance: float = 0.05
-    """Greatest difference of depths of one surface, as a share of the depth: the noise of sensors and of true poses
-    stays below it indoors, the gap between a thing and what it hides above it."""
+    """Greatest difference of depths of one surface, as a share of the depth: indoors the noise of sensors and true
+    poses is below it, the gap between an object and the surface behind above it."""
     most_deg: float = 75.0
-    """Greatest angle between two lines of sight at which a surface counts as seen again: two cameras that face each
-    other down a corridor see the same walls, but nobody knows them again."""
+    """Greatest angle between two lines of sight at which a surface counts as seen again: two cameras facing each other
+    down a corridor see the same walls but cannot be matched."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Covisibility:
     time_s: Array
     """Seconds. Shape (F,)."""
     share: Shares
-    """Part of what frame i sees that frame j sees too, in [0, 1], NaN where it is not known. Shape (F, F)."""
+    """Part of the surface of frame i that frame j sees too, in [0, 1], NaN where it is not known. Shape (F, F)."""
 
     def __post_init__(self) -> None:
         count = len(self.frame)
@@ -65,11 +65,10 @@ def covisibility(
 ) -> Shares:
     """Return shares (F, F) from depth maps (F, h, w) along z, 0 where unknown, poses (F, 4, 4) and camera of the maps.
 
-    A point of frame i is seen in frame j when it lies in j's picture, seen from about the same side, and j's depth
-    there agrees: within the tolerance of the span of the four pixels around it, so that a steep surface on a coarse
-    map is not lost. Where j has no depth the point says nothing and is left out, though at most half of them.
-    Rows and columns of frames without a finite pose or without depth are NaN. Raises `OptionError` for shapes that do
-    not fit.
+    A point of frame i is seen in frame j when it is in j's picture, seen from about the same side, and j's depth there
+    agrees: within the tolerance of the span of the four pixels around it, so that a steep surface on a coarse map is
+    not lost. Where j has no depth the point says nothing and is left out, though at most half of them. Rows and columns
+    of frames without a finite pose or without depth are NaN. Raises `OptionError` for shapes that do not fit.
     """
     chosen = settings or CovisibilitySettings()
     maps, poses = np.asarray(depth), np.asarray(T_world_cam, dtype=np.float64)
@@ -119,7 +118,7 @@ def _spans(maps: NDArray[Any]) -> tuple[Shares, Shares]:
 
 @dataclass(frozen=True)
 class _Views:
-    """What G frames see."""
+    """Surfaces seen by G frames."""
 
     T_cam_world: Array
     """Shape (G, 4, 4)."""
@@ -158,7 +157,7 @@ def write_covisibility(path: str | Path, found: Covisibility) -> None:
 
 
 def read_covisibility(path: str | Path) -> Covisibility:
-    """Read what `write_covisibility` wrote. Raises `SourceError` for a file that is absent or something else."""
+    """Read a file of `write_covisibility`. Raises `SourceError` for one that is absent or another kind."""
     try:
         check_ordinary(Path(path).stat(), Path(path))
         with Path(path).open("rb") as file:

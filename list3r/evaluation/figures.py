@@ -1,4 +1,4 @@
-"""Pictures of what was measured, as PNG, PDF or SVG by the file's ending."""
+"""Figures of evaluations, as PNG, PDF or SVG by the file's ending."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MOST_POINTS = 60_000
 
 
 UPRIGHT: tuple[Array, str] = (np.eye(3)[:2], "seen along -z")
-"""The page of a world of which z is up, see `page_axes`."""
+"""The page of a world with z up, see `page_axes`."""
 
 
 def check_ending(path: str | Path) -> Path:
@@ -50,10 +50,10 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def page_axes(T_world_cam: Array) -> tuple[Array, str]:
-    """Return page's right and up in the world for a view from above, shape (2, 3), and what it is seen along, in words.
+    """Return page's right and up in the world for a view from above, shape (2, 3), and the viewing direction in words.
 
-    Up is taken from the cameras: the axis of the world nearest to their mean up if it is within 30 degrees, else
-    that mean.
+    Up is taken from the cameras: the axis of the world nearest to their mean up if it is within 30 degrees, else that
+    mean.
     """
     up = -T_world_cam[:, :3, 1].mean(axis=0)
     length = float(np.linalg.norm(up))
@@ -109,7 +109,7 @@ def trajectory_figure(truth: Trajectory, moments: Array, positions: Array, error
 
 
 def _gaps(moments: Array) -> NDArray[np.bool_]:
-    """Tell which steps are gaps in which there are no poses: over three times the usual step. Shape (P-1,)."""
+    """Return which steps are gaps in which there are no poses: over three times the usual step. Shape (P-1,)."""
     steps = np.diff(moments)
     return np.asarray(steps > 3 * np.median(steps))
 

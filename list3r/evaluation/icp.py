@@ -35,7 +35,7 @@ class IcpSettings:
 def register(
     truth: ArrayLike, truth_normals: ArrayLike, estimate: ArrayLike, *, with_scale: bool, settings: IcpSettings
 ) -> Sim3:
-    """Return S_truth_estimate by point-to-plane ICP (Chen and Medioni 1992), for clouds (M, 3), (N, 3) that nearly lie
+    """Return S_truth_estimate by point-to-plane ICP (Chen and Medioni 1992), for clouds (M, 3), (N, 3) that nearly are
     right.
 
     Raises `DegenerateError` when too few points have a partner, and when the surfaces leave a motion open.
@@ -53,8 +53,8 @@ def register(
         near = np.isfinite(distance)
         if near.sum() < max(10, settings.least_share * len(p)):
             raise DegenerateError(
-                f"{near.sum()} of {len(p)} points lie within {reach:.2f} m of the truth: ICP needs clouds that nearly "
-                "lie right; align by --align TRAJECTORY first"
+                f"{near.sum()} of {len(p)} points are within {reach:.2f} m of the truth: ICP needs nearly "
+                "aligned clouds; align by --align TRAJECTORY first"
             )
         step = _step(moved[near], q[row[near]], n[row[near]], reach, with_scale, settings.least_stiffness)
         S = step @ S

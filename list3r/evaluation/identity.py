@@ -1,4 +1,4 @@
-"""Whether things keep their ids over time: masks of every frame against the true ids of its pixels."""
+"""Whether objects keep their ids over time: masks of every frame against the true ids of its pixels."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class IdentityErrors(JsonFields):
-    """Ids that true objects carry over time."""
+    """Estimated ids of true objects over time."""
 
     frames: int
-    """Frames that were looked at."""
+    """Compared frames."""
     objects: int
     """True objects that some mask covered in some frame."""
     switches: int
     """Times that an object's id is another one than when it was covered last (CLEAR MOT's mismatches)."""
     several_ids: dict[int, tuple[int, ...]]
-    """Objects that carried more than one id, with the ids in the order in which they came."""
+    """Objects that had more than one id, with the ids in the order in which they came."""
 
 
 def evaluate_identities(
@@ -38,23 +38,23 @@ def evaluate_identities(
     """Follow the ids of true objects.
 
     Each frame is the true ids of its pixels (H, W), 0 for nothing, and the estimated masks (H, W) with their ids. An
-    object carries an id when that mask's IoU with its pixels is `least_iou` or more; while the id it had last does, it
-    keeps it. `wanted` are the true ids that count, None all. Raises `OptionError` for masks of another size.
+    object has an id when that mask's IoU with its pixels is `least_iou` or more; its last id has priority. `wanted` are
+    the counted true ids, None for all. Raises `OptionError` for masks of another size.
     """
-    carried: dict[int, list[int]] = {}
+    ids_of: dict[int, list[int]] = {}
     count = switches = 0
     for labels, masks in frames:
         count += 1
         for true_id, ids in _covered(labels, masks, least_iou).items():
             if wanted is not None and true_id not in wanted:
                 continue
-            history = carried.setdefault(true_id, [])
+            history = ids_of.setdefault(true_id, [])
             if history and history[-1] in ids:
                 continue
             switches += bool(history)
             history.append(ids[0])
-    several = {k: tuple(dict.fromkeys(h)) for k, h in sorted(carried.items()) if len(set(h)) > 1}
-    return IdentityErrors(count, len(carried), switches, several)
+    several = {k: tuple(dict.fromkeys(h)) for k, h in sorted(ids_of.items()) if len(set(h)) > 1}
+    return IdentityErrors(count, len(ids_of), switches, several)
 
 
 def _covered(labels: Labels, masks: Sequence[tuple[int, Mask]], least_iou: float) -> dict[int, list[int]]:

@@ -35,7 +35,7 @@ class InstanceErrors(JsonFields):
     mean_center_error_m: float
     """Distance of the centres of matched pairs, 0 without any."""
     duplicates: int
-    """Estimated objects that lie for the greater part in a true object that another one matched."""
+    """Estimated objects that are for the greater part in a true object that another one matched."""
     duplicates_per_object: float
     """Duplicates for each true object that was matched."""
     merged_pairs: int
@@ -64,10 +64,10 @@ def evaluate_instances(
 ) -> InstanceErrors:
     """Match upright boxes of one frame of reference one to one and count what is left over.
 
-    An unmatched estimate is a duplicate when the true object it overlaps best (by IoU) is matched by another one and
-    holds more than half of its volume. Two true objects are merged when one estimate covers more than half of either
-    and not both are matched; pairs of which one lies mostly in the other's box by right, as a ball in a bowl does, do
-    not count. `is_round` marks true objects without a yaw, see `box_overlaps`.
+    An unmatched estimate is a duplicate when the true object of its best IoU is matched by another estimate and
+    contains more than half of its volume. Two true objects are merged when one estimate covers more than half of each
+    and not both are matched; pairs with one mostly inside the other's true box, as a ball in a bowl, do not count.
+    `is_round` marks true objects without a yaw, see `box_overlaps`.
     """
     iou, inside = box_overlaps(truth, estimate, is_round)
     pairs = match_boxes(iou, iou_threshold)

@@ -44,7 +44,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     """Return points of a PLY, PCD or mesh file, of a table of x y z ... lines, or of an array (N, 3 or more) in `.npy`.
 
     The faces of a mesh become points about 1 cm apart. Points that are not finite are left out. Raises `SourceError`
-    for what is none of these, or holds no point.
+    for another kind of file or one without points.
     """
     path = Path(path)
     ending = path.suffix.lower()

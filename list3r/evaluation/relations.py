@@ -25,7 +25,7 @@ class PredicateErrors:
 
 @dataclass(frozen=True)
 class RelationErrors(JsonFields):
-    """Relations over matched objects: what is said of an object that is no true one counts neither way."""
+    """Relations over matched objects: relations of unmatched objects are ignored."""
 
     total: PredicateErrors
     by_predicate: dict[str, PredicateErrors]

@@ -1,8 +1,8 @@
 """Loop candidates against covisibility: which claimed revisits are true, which true ones were found.
 
-A pair of frames is a *revisit* when each sees at least `least` of what the other sees, and *different* when either
-sees less than `different` of it; pairs in between count neither way. A pair of chunks is a revisit when any of its
-frame pairs is, different when all of its frame pairs are. Chunks that follow on one another are no revisits.
+A pair of frames is a *revisit* when each sees at least the share `least` of the other's surface, and *different* when
+either sees less than `different` of it; pairs in between are ignored. A pair of chunks is a revisit when any of its
+frame pairs is, different when all are. Chunks that follow on one another are no revisits.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class RevisitTruthSettings:
     """When two frames see the same place."""
 
     least: float = 0.3
-    """Least share of the surface, both ways, of a revisit: where pairs of 40 % overlap and more are the hard ones of
-    matching benchmarks (SuperGlue on ScanNet), 30 % still carries an alignment."""
+    """Least share of the surface, both ways, of a revisit: the hard pairs of matching benchmarks start at 40 % overlap
+    (SuperGlue on ScanNet), and 30 % still suffices for an alignment."""
     different: float = 0.1
     """Share of the surface, either way, below which two frames see different places: below 10 % even the pairs of
     MegaDepth's hardest training sets end."""
@@ -79,7 +79,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class RevisitJudgement:
-    """Candidates of one video with what is true of them. Several videos are scored together."""
+    """Candidates of one video with their ground truth. Several videos are scored together."""
 
     candidates: Candidates
     frame_labels: NDArray[np.int8]
@@ -95,7 +95,7 @@ class Agreement:
     """How well claims agree with the truth at one level."""
 
     true: int
-    """What there is to find."""
+    """Number of true revisits."""
     claimed: int
     """Accepted, open ones left out."""
     correct: int
@@ -123,7 +123,7 @@ class Ranking:
 
 @dataclass(frozen=True)
 class RevisitScores(JsonFields):
-    """Revisits found against those that there are."""
+    """Recall of revisits."""
 
     settings: RevisitTruthSettings
     candidates: int
@@ -148,11 +148,11 @@ def judge(
     neighbours: Collection[tuple[int, int]] | None = None,
     settings: RevisitTruthSettings | None = None,
 ) -> RevisitJudgement:
-    """Tell which candidates of a video are true.
+    """Return which candidates of a video are true.
 
-    `spans` gives the first and last Frame.index of each chunk. `neighbours` are pairs of chunks that are no revisits
-    whatever they see; None takes those that share frames. A candidate's frame is looked up at the nearest frame of
-    `covisibility`, if that is within its greatest step.
+    `spans` gives the first and last Frame.index of each chunk. `neighbours` are pairs of chunks that never count as
+    revisits; None takes pairs that share frames. A candidate's frame is mapped to the nearest frame of `covisibility`,
+    if that is within its greatest step.
     """
     chosen = settings or RevisitTruthSettings()
     same, apart = frame_labels(covisibility.share, chosen)
@@ -171,7 +171,7 @@ def judge(
 def frame_labels(
     share: ArrayLike, settings: RevisitTruthSettings | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Tell which frame pairs are revisits and which see different places, by directed shares (F, F); NaN is neither."""
+    """Return which frame pairs are revisits and which different places, by directed shares (F, F); NaN is neither."""
     chosen = settings or RevisitTruthSettings()
     s = np.asarray(share)
     return np.minimum(s, s.T) >= chosen.least, np.maximum(s, s.T) < chosen.different
@@ -227,7 +227,7 @@ def recall_at_precision(
 
 
 def average_precision(scores: ArrayLike, labels: ArrayLike, total: int) -> float | None:
-    """Return mean over all `total` true ones of precision at which each is found, 0 for those that are never found."""
+    """Return the average precision over all `total` true revisits, 0 for those never found."""
     if total <= 0:
         return None
     _, right, chosen = _cumulative(scores, labels)
@@ -299,7 +299,7 @@ def _chunk_pairs(
     spans: Mapping[int, tuple[int, int]],
     neighbours: set[tuple[int, int]],
 ) -> tuple[set[tuple[int, int]], set[tuple[int, int]]]:
-    """Return pairs of chunks that are revisits, and those that see different places throughout."""
+    """Return pairs of chunks that are revisits, and pairs that see different places throughout."""
     rows = {k: np.flatnonzero((frame >= first) & (frame <= last)) for k, (first, last) in spans.items()}
     true_pairs, false_pairs = set(), set()
     ids = sorted(spans)

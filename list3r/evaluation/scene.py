@@ -20,9 +20,9 @@ from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz, r
 from list3r.memory.unpacking import parse_json
 
 _REACH_M = 2.0
-"""How far away things are from a camera indoors."""
+"""How far away objects are from a camera indoors."""
 _SAME_AXES_DEG = 10.0
-"""Beyond what a path of half a metre with errors of centimetres leaves open, axes are other ones."""
+"""Axes differ beyond this angle; a path of half a metre with errors of centimetres stays below it."""
 
 
 def read_scene(path: str | Path) -> dict[str, Any]:
@@ -59,9 +59,9 @@ def scene_relations(scene: Mapping[str, Any]) -> list[tuple[int, str, int]]:
 def alignment_of(truth: Trajectory, estimate: Trajectory, *, with_scale: bool, tolerance_s: float = 0.01) -> Sim3:
     """Return S_truth_scene from the camera's poses in both frames of reference. Raises as `align` does.
 
-    A path of a metre leaves a turn open that shifts things three metres away by centimetres. So what is laid on one
-    another is, beside the cameras, a point on each of their axes as far away as things are; but only where both
-    trajectories mean the same axes.
+    A path of a metre leaves a rotation uncertain that shifts objects three metres away by centimetres. So the alignment
+    uses the camera centres and a point on each optical axis at the objects' distance, where both trajectories use the
+    same axes.
     """
     rows_truth, rows = associate(truth.time_s, estimate.time_s, tolerance_s)
     if len(rows) < 3:
@@ -94,7 +94,7 @@ def evaluate_scene_instances(
 ) -> InstanceErrors:
     """Match the objects of a scene with the true ones that once covered `min_px` pixels of a frame, structure aside.
 
-    What matches a true thing that was hardly in view counts neither way. `matches` names ids, not rows.
+    Matches of true objects that were hardly in view are ignored. `matches` names ids, not rows.
     """
     true, boxes = scene_boxes(truth), scene_boxes(scene, S_truth_scene)
     faint = set(true) - _seen_ids(truth, min_px)
@@ -119,11 +119,11 @@ def _evaluate_by_id(
 def evaluate_scene(
     scene: Mapping[str, Any], truth: Mapping[str, Any], S_truth_scene: Sim3 | None = None, min_px: int = 150
 ) -> dict[str, Any]:
-    """Evaluate everything at once, as plain numbers: instances at IoU 0.25 and 0.5, relations over those matched at
+    """Evaluate everything at once, as plain numbers: instances at IoU 0.25 and 0.5, relations over objects matched at
     0.25.
 
     `S_truth_scene` takes the scene's world to that of the truth (see `alignment_of`); None when they are the same.
-    `matched_ids` lists (true id, scene id, IoU), `missed` the true things without a match.
+    `matched_ids` lists (true id, scene id, IoU), `missed` the true objects without a match.
     """
     loose = evaluate_scene_instances(scene, truth, S_truth_scene, 0.25, min_px)
     strict = evaluate_scene_instances(scene, truth, S_truth_scene, 0.50, min_px)

@@ -1,4 +1,4 @@
-"""Trajectory errors: ATE after SE(3) and Sim(3) alignment, RPE at a stated delta, and what was not covered.
+"""Trajectory errors: ATE after SE(3) and Sim(3) alignment, RPE at a stated delta, and coverage.
 
 The conventions are those of evo and of the TUM RGB-D benchmark (Sturm et al., "A benchmark for the evaluation of RGB-D
 SLAM systems", 2012): poses are associated by time, the alignment is Umeyama's over all associated positions.
@@ -92,19 +92,19 @@ class Delta:
 
 _DELTA_UNITS = ("frames", "m", "s")
 _DELTA_TOLERANCE = 0.1
-"""Greatest difference of a distance in metres or seconds from what is wanted, as a share of it (as in evo)."""
+"""Greatest deviation from the wanted distance in metres or seconds, as a share of it (as in evo)."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What part of the truth the estimate has poses for."""
+    """Share of the truth for which the estimate has poses."""
 
     truth: float
     """Share of the time that the truth lasts in which the estimate has poses."""
     gaps: int
     """Stretches inside the estimate without poses: over three times its usual step."""
     longest_gap_s: float
-    """Of those, and of what is missing at the beginning and the end; 0 where nothing is missing."""
+    """Of gaps, also at the beginning and the end; 0 where nothing is missing."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ def evaluate_trajectory(
 ) -> TrajectoryErrors:
     """Measure the errors of an estimate against the truth.
 
-    RPE relates associated poses that lie `delta` apart (None: `delta_frames` frames), all of them, overlapping. Raises
+    RPE relates associated poses that are `delta` apart (None: `delta_frames` frames), all of them, overlapping. Raises
     `OptionError` when the two share too few moments, `DegenerateError` when the positions do not determine an
     alignment.
     """
@@ -281,10 +281,10 @@ def align(truth: Trajectory, estimate: Trajectory, *, with_scale: bool) -> Sim3:
 
 
 def delta_pairs(truth: Trajectory, delta: Delta) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return rows of the poses that lie `delta` apart, two of shape (P,). Raises `OptionError` when there are none.
+    """Return rows of the poses that are `delta` apart, two of shape (P,). Raises `OptionError` when there are none.
 
-    Metres count along the true path and seconds on the clock: each pose is paired with the later one whose distance is
-    nearest to what is wanted, if it is within a tenth of it (evo's all pairs, with pairs from the reference).
+    Metres count along the true path and seconds on the clock: each pose is paired with the later one at the distance
+    nearest to `delta`, if within a tenth of it (evo's all pairs, with pairs from the reference).
     """
     count = len(truth.time_s)
     if delta.unit == "frames":
@@ -301,7 +301,7 @@ def delta_pairs(truth: Trajectory, delta: Delta) -> tuple[NDArray[np.int64], NDA
         near = np.abs(along[end] - wanted[:-1]) <= _DELTA_TOLERANCE * delta.value
         start, end = start[near], end[near]
     if len(start) == 0:
-        raise OptionError(f"no two of {count} associated poses lie {delta} apart: give a smaller delta")
+        raise OptionError(f"no two of {count} associated poses are {delta} apart: give a smaller delta")
     return start.astype(np.int64), end.astype(np.int64)
 
 

@@ -16,7 +16,8 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class Component:
-    """What shares one coordinate frame. Two components were never placed against each other: do not overlay them."""
+    """Chunks and instances in one coordinate frame. Components are not placed against each other: do not overlay
+    them."""
 
     id: int
     """The smallest chunk id of it."""
@@ -87,7 +88,7 @@ def point_spacing(points: NDArray[np.float32]) -> float:
 
 
 def has_box(instance: Instance) -> bool:
-    """Tell whether the instance has finite geometry."""
+    """Return whether the instance has finite geometry."""
     box = instance.box
     return bool(np.isfinite([*box.center, *box.size, *box.rotation.ravel()]).all())
 

@@ -11,11 +11,11 @@ from list3r.exporters.tables import COLUMNS, Table, Value, rows_of
 from list3r.memory.store.store import Store
 
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")
-"""What a cell begins with that a spreadsheet computes, the wide forms of the signs too (OWASP, CSV Injection)."""
+"""First characters of a cell that a spreadsheet computes, the wide forms of the signs too (OWASP, CSV Injection)."""
 
 
 def write_csv(store: Store, path: str | Path) -> tuple[Path, ...]:
-    """Write the instances to `path` and the relations to `NAME.relations.csv` beside it. Returns both files.
+    """Write the instances to `path` and the relations to `NAME.relations.csv` next to it. Returns both files.
 
     The first row names the columns, see `tables.COLUMNS`. Text is UTF-8; an unknown value is an empty cell. A text that
     a spreadsheet would take for a formula gets a single quote before it. Rows of all components are in one table:

@@ -22,19 +22,19 @@ T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 
 """glTF has y up: its x, y, z are the world's x, z, -y."""
 
 _ARRAY_BUFFER = 34962
-"""What holds attributes of vertices, by the numbers of OpenGL."""
+"""Buffer targets of vertex attributes, by the numbers of OpenGL."""
 _EDGES = ((0, 1), (0, 2), (0, 4), (3, 1), (3, 2), (3, 7), (5, 1), (5, 4), (5, 7), (6, 2), (6, 4), (6, 7))
 """Pairs of `OrientedBox.corners` that differ along one axis."""
 
 
 @dataclass(frozen=True)
 class GlbSettings:
-    """What goes into the file."""
+    """Content of the file."""
 
     color: str = "rgb"
     """Of the points. rgb: the colours that were seen; instance: one colour an instance, the same in every export."""
     points_per_instance: int = 5000
-    """At most this many points of a thing."""
+    """At most this many points of an instance."""
     points_per_structure: int = 20000
     """At most this many points of a floor, a wall and the like."""
 
@@ -43,7 +43,8 @@ class GlbSettings:
 
 
 def write_glb(store: Store, path: str | Path, settings: GlbSettings | None = None) -> tuple[Path, ...]:
-    """Write node `instance_12 mug` with its children `instance_12_points` and, for things, `instance_12_box` (lines).
+    """Write node `instance_12 mug` with its children `instance_12_points` and, for instances, `instance_12_box`
+    (lines).
 
     The node `world` above them turns z up into the y up of glTF. Facts of an instance are the `extras` of its geometry.
     Each component is a file of its own, the main one at `path`. Returns the files written.
@@ -86,7 +87,7 @@ def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
 
 
 def _say_what_buffers_hold(tree: dict[str, Any]) -> None:
-    """Mark views of attributes as what they are, which validators of glTF ask for and trimesh leaves out."""
+    """Set the target of attribute views, which glTF validators ask for and trimesh leaves out."""
     used = {n for mesh in tree["meshes"] for part in mesh["primitives"] for n in part["attributes"].values()}
     for view in {tree["accessors"][n]["bufferView"] for n in used}:
         tree["bufferViews"][view]["target"] = _ARRAY_BUFFER

@@ -22,14 +22,14 @@ Write = Callable[["networkx.Graph", Path], None]
 def write_graphml(store: Store, path: str | Path) -> tuple[Path, ...]:
     """Write instances and relations to `path`, local instances and merges to `NAME.merges.graphml`; return both files.
 
-    What is unknown has no attribute. Vectors are an attribute for each number (`center_x`); edges have an `id`.
+    Unknown values have no attribute. Vectors are an attribute for each number (`center_x`); edges have an `id`.
     """
     return _write_both(store, Path(path), _write_graphml)
 
 
 def write_node_link(store: Store, path: str | Path) -> tuple[Path, ...]:
     """Write the same graphs in the node-link form of networkx and D3: `nodes` with `id`, `edges` with `source` and
-    `target`. What is unknown is left out.
+    `target`. Unknown values are left out.
     """
     return _write_both(store, Path(path), _write_node_link)
 

@@ -22,10 +22,10 @@ T = TypeVar("T")
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path` to write to; it replaces `path` when the block ends without an error.
+    """Yield a temporary name next to `path` to write to; it replaces `path` when the block ends without an error.
 
-    Raises `ExportError` before the block when the folder is absent or not writable or when something stands at `path`
-    that an export must not replace (a folder, a device, a memory file), and for every failure of the disk inside it.
+    Raises `ExportError` before the block when the folder is absent or not writable or when something is at `path` that
+    an export must not replace (a folder, a device, a memory file), and for every failure of the disk inside it.
     """
     path = Path(path)
     check_target(path)
@@ -56,10 +56,10 @@ def write_together(parts: Iterable[tuple[Path, T]], write: Callable[[T, Path], N
 
 @contextlib.contextmanager
 def replacing_folder(folder: str | Path, kind: str) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder`; it takes its place when the block ends without an error.
+    """Yield a temporary folder next to `folder`; it takes its place when the block ends without an error.
 
-    The file `list3r-KIND.json` in it says whose it is: a folder that has one is replaced, another one that holds files
-    is refused. Raises `ExportError` for that, and for every failure of the disk inside the block.
+    The file `list3r-KIND.json` marks it: a folder that has one is replaced, any other folder with files is refused.
+    Raises `ExportError` for that, and for every failure of the disk inside the block.
     """
     folder, ours = Path(folder), f"list3r-{kind}.json"
     if not folder.parent.is_dir():
@@ -71,7 +71,7 @@ def replacing_folder(folder: str | Path, kind: str) -> Iterator[Path]:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / ours).is_file():
             raise ExportError(f"{folder} holds other files; name a new folder for the export")
         for left in _left_behind(folder, f".{folder.name}.*.old"):
-            if not folder.exists():  # what stood here before, where the change of the two was cut short
+            if not folder.exists():  # the earlier folder, where the exchange was interrupted
                 left.replace(folder)
             shutil.rmtree(left, ignore_errors=True)
         for left in [*_left_behind(folder, f".{folder.name}.*.tmp"), temporary]:
@@ -95,7 +95,7 @@ def replacing_folder(folder: str | Path, kind: str) -> Iterator[Path]:
 
 
 def _left_behind(path: Path, pattern: str) -> list[Path]:
-    """Return what exports to `path` have left there whose process was killed; its number is the `*`."""
+    """Return leftovers of killed exports to `path`; the number of the process is the `*`."""
     if sys.platform == "win32":  # where asking for a process would end it
         return []
     before, after = pattern.split("*")
@@ -143,7 +143,7 @@ def is_database(path: Path) -> bool:
 
 
 def part_path(path: Path, name: str) -> Path:
-    """Return the path of one more file of an export: `scene.component_7.ply` beside `scene.ply`; `path` for no name."""
+    """Return the path of a further file: `scene.component_7.ply` next to `scene.ply`; `path` for no name."""
     return path.with_name(f"{path.stem}.{name}{path.suffix}") if name else path
 
 

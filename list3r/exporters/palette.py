@@ -35,7 +35,7 @@ def instance_color(instance_id: int, chroma: float = 0.15) -> Color:
 
 
 def structure_color(instance_id: int) -> Color:
-    """Return a greyish colour for floor, walls and the like, so that things stand out before them."""
+    """Return a greyish colour for floor, walls and the like, so that instances contrast with them."""
     return instance_color(instance_id, chroma=0.02)
 
 

@@ -33,7 +33,7 @@ _PLY_TYPES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
 
 @dataclass(frozen=True)
 class PlySettings:
-    """What goes into the point cloud."""
+    """Content of the point cloud."""
 
     color: str = "instance"
     """instance: one colour an instance, the same in every export; rgb: the colours that were seen."""

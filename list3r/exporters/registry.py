@@ -48,7 +48,7 @@ class Format:
     of_memory: bool = False
     """Whether it is written through the face for Python."""
     package: str = ""
-    """The package that it takes besides those of the extra `export`, as it is imported."""
+    """The package that it needs besides the extra `export`, by its import name."""
     settings: str = ""
     """The dataclass of its options."""
     address_space_mb: int = 0
@@ -111,7 +111,7 @@ FORMATS: dict[str, Format] = {
         options=("tokens", "question"),
     ),
 }
-"""Formats by name. Those that hold one coordinate frame write a further file for each further component."""
+"""Formats by name. A format with one coordinate frame writes a further file for each further component."""
 
 
 def export(

@@ -27,8 +27,8 @@ def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
     """Write `world/instances/12` (points and a named box), `world/relations` and `world/camera` as an .rrd file.
 
     Of more than 1,000 instances a thousand share an entity, `world/instances/1_to_1000`; the box or the point that is
-    clicked says its id. The camera and its pictures lie on the time line `time_s` of their session. A component that
-    was not placed against the main one is `component_7` beside `world`. Returns the file written.
+    clicked says its id. The camera and its pictures are on the time line `time_s` of their session. A component that
+    was not placed against the main one is `component_7` next to `world`. Returns the file written.
     """
     import rerun as rr
 
@@ -54,7 +54,7 @@ def write_rerun(store: Store, path: str | Path) -> tuple[Path, ...]:
 
 
 def _groups(instances: Sequence[Instance]) -> dict[str, Sequence[Instance]]:
-    """Return instances by the name of their entity: alone, or where they are many those that follow each other."""
+    """Return instances by the name of their entity: one each, or consecutive groups where they are many."""
     if len(instances) <= _ALONE:
         return {str(i.id): [i] for i in instances}
     blocks = [instances[n : n + _TOGETHER] for n in range(0, len(instances), _TOGETHER)]

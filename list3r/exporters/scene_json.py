@@ -108,7 +108,7 @@ def instance_entry(
 ) -> dict[str, Any]:
     """Return one entry of `instances`; lengths rounded to this many decimals.
 
-    `track` are the seconds (V,) and places (V, 3) of a thing that moves; without them the entry has none.
+    `track` are the seconds (V,) and places (V, 3) of an instance that moves; without them the entry has none.
     """
     box, view = instance.box, instance.best_view
     low, high = _vector(instance.aabb[0], decimals), _vector(instance.aabb[1], decimals)

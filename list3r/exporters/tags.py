@@ -29,27 +29,27 @@ class TagTarget:
 
     @property
     def small(self) -> bool:
-        """Whether a tag on top would hide the thing."""
+        """Whether a tag on top would hide the instance."""
         return self.half[0] < self.tag[0] or self.half[1] < self.tag[1] * 1.2
 
 
-def place_tags(anchors: Sequence[TagTarget], page: Rect) -> list[tuple[float, float]]:
-    """Return the middles of the tags, px, one for each anchor: the nearest place that is free, small things first.
+def place_tags(targets: Sequence[TagTarget], page: Rect) -> list[tuple[float, float]]:
+    """Return the middles of the tags, px, one for each anchor: the nearest place that is free, small instances first.
 
-    Tags avoid each other and the small things, and the lines to tags avoid each other. Where nothing is free within the
-    search radius the place of least overlap is taken.
+    Tags avoid each other and the small instances, and the lines to tags avoid each other. Where nothing is free within
+    the search radius the place of least overlap is taken.
     """
     leaders: list[tuple[float, float, float, float]] = []
-    boxes = [_around(a.xy, a.half) for a in anchors if a.small]
-    owner = np.array([n for n, a in enumerate(anchors) if a.small], dtype=int)
-    places: list[tuple[float, float]] = [(0.0, 0.0)] * len(anchors)
-    order = sorted(range(len(anchors)), key=lambda n: (not anchors[n].small, anchors[n].half[0] * anchors[n].half[1]))
+    boxes = [_around(a.xy, a.half) for a in targets if a.small]
+    owner = np.array([n for n, a in enumerate(targets) if a.small], dtype=int)
+    places: list[tuple[float, float]] = [(0.0, 0.0)] * len(targets)
+    order = sorted(range(len(targets)), key=lambda n: (not targets[n].small, targets[n].half[0] * targets[n].half[1]))
     for n in order:
-        anchor = anchors[n]
+        target = targets[n]
         others = np.array(boxes, dtype=float).reshape(-1, 4)[owner != n]
-        places[n] = _nearest_free(anchor, others, page, np.array(leaders, dtype=float).reshape(-1, 4))
-        leaders.append((*anchor.xy, *places[n]))
-        boxes.append(_around(places[n], (anchor.tag[0] / 2 + 2, anchor.tag[1] / 2 + 2)))
+        places[n] = _nearest_free(target, others, page, np.array(leaders, dtype=float).reshape(-1, 4))
+        leaders.append((*target.xy, *places[n]))
+        boxes.append(_around(places[n], (target.tag[0] / 2 + 2, target.tag[1] / 2 + 2)))
         owner = np.append(owner, -1)
     return places
 
@@ -59,17 +59,17 @@ def _around(xy: tuple[float, float], half: tuple[float, float]) -> Rect:
 
 
 def _nearest_free(
-    anchor: TagTarget, boxes: NDArray[np.float64], page: Rect, leaders: NDArray[np.float64]
+    target: TagTarget, boxes: NDArray[np.float64], page: Rect, leaders: NDArray[np.float64]
 ) -> tuple[float, float]:
-    half = np.array(anchor.tag) / 2
+    half = np.array(target.tag) / 2
     low, high = np.array(page[:2]) + half, np.array(page[2:]) - half
-    best, least = anchor.xy, np.inf
-    for ring in _rings(anchor):
+    best, least = target.xy, np.inf
+    for ring in _rings(target):
         places = np.clip(ring, low, np.maximum(low, high))
         left = np.maximum(places[:, None] - half, boxes[None, :, :2])
         right = np.minimum(places[:, None] + half, boxes[None, :, 2:])
         overlap = np.maximum(right - left, 0.0).prod(axis=2).sum(axis=1)
-        overlap = overlap + _CROSSING_PX2 * crossings(np.array(anchor.xy), places, leaders)
+        overlap = overlap + _CROSSING_PX2 * crossings(np.array(target.xy), places, leaders)
         k = int(np.argmin(overlap))
         if overlap[k] < least:
             best, least = (float(places[k, 0]), float(places[k, 1])), float(overlap[k])
@@ -88,17 +88,17 @@ def crossings(start: NDArray[np.float64], ends: NDArray[np.float64], leaders: ND
 
 
 def _side(a: NDArray[np.float64], b: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Tell on which side of the line from a to b a point lies, by sign."""
+    """Return the side of the line from a to b on which a point is, by sign."""
     return np.asarray((b - a)[..., 0] * (p - a)[..., 1] - (b - a)[..., 1] * (p - a)[..., 0])
 
 
-def _rings(anchor: TagTarget) -> Iterator[NDArray[np.float64]]:
+def _rings(target: TagTarget) -> Iterator[NDArray[np.float64]]:
     """Return places round an anchor, the best first: on it if it is large, then rings of growing radius. Shape (R, 2)
     each."""
-    middle, across = np.array(anchor.xy), np.array(anchor.tag)
-    start = np.array(anchor.half) + across / 2 + 3 if anchor.small else np.zeros(2)
-    if not anchor.small:
+    middle, across = np.array(target.xy), np.array(target.tag)
+    start = np.array(target.half) + across / 2 + 3 if target.small else np.zeros(2)
+    if not target.small:
         yield middle[None]
-    for step in range(0 if anchor.small else 1, 40):
+    for step in range(0 if target.small else 1, 40):
         radius = start + step * across[1] * 0.6
         yield middle + np.stack([np.cos(_ANGLES) * radius[0], np.sin(_ANGLES) * radius[1]], axis=1)

@@ -19,7 +19,7 @@ def write_tum(store: Store, path: str | Path) -> tuple[Path, ...]:
     """Write `T_world_cam` of every posed frame (colour camera) as `time_s tx ty tz qx qy qz qw`, in the order of time.
 
     Sessions have clocks of their own and components frames of reference of their own, so each pair of them is one
-    trajectory: the longest goes to `path`, the others beside it. Returns the files written.
+    trajectory: the longest goes to `path`, the others next to it. Returns the files written.
     """
     unit = "metres" if units(store) == "m" else "arbitrary units (relative scale)"
 

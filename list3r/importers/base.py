@@ -1,4 +1,4 @@
-"""A map that another program made: things with surface points, in a world with z up."""
+"""A map that another program made: objects with surface points, in a world with z up."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GRAY = (160, 160, 160)
 
 
 IMPORTED = Fact[dict[str, Any] | None]("imported", dict, None)
-"""Where an imported map comes from: `format`, `path`, `notes`, and `names`, what the map calls each local instance."""
+"""Where an imported map comes from: `format`, `path`, `notes`, and `names`, the map's name of each local instance."""
 
 
 def imported_as(store: Store, instance_id: int) -> dict[str, Any] | None:
@@ -43,18 +43,18 @@ def imported_as(store: Store, instance_id: int) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True)
-class ImportedThing:
-    """One thing of the map."""
+class ImportedObject:
+    """One object of the map."""
 
     name: str
-    """What the map calls it: its id there."""
+    """Its id in the map."""
     label: str | None
     points: NDArray[np.float32]
     """World coordinates of the map. Shape (N, 3)."""
     rgb: NDArray[np.uint8] | None = None
     """Colour. Shape (N, 3)."""
     feature: NDArray[np.float32] | None = None
-    """Embedding of its look. Shape (D,)."""
+    """Embedding of its appearance. Shape (D,)."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class ImportedMap:
     """All that was read."""
 
     format: str
-    things: tuple[ImportedThing, ...]
+    objects: tuple[ImportedObject, ...]
     metric: bool = True
     notes: tuple[str, ...] = ()
-    """What the file does not say or what was left out, one sentence each."""
+    """Missing or omitted content, one sentence each."""
 
 
 def read_json_file(path: Path) -> Any:

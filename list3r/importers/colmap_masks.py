@@ -1,6 +1,6 @@
-"""A COLMAP model whose pictures have masks of things: every point belongs to what most of its pictures say.
+"""A COLMAP model whose pictures have masks of objects: every point belongs to the object of most of its pictures.
 
-`sparse/0` is the model, `masks/` holds a PNG for each picture (its name with `.png`) with the number of the thing in
+`sparse/0` is the model, `masks/` holds a PNG for each picture (its name with `.png`) with the number of the object in
 each pixel, the same number in all pictures, 0 for nothing. The model has a unit of its own.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.decoding.decode import read_raw_depth
-from list3r.importers.base import ImportedMap, ImportedThing
+from list3r.importers.base import ImportedMap, ImportedObject
 from list3r.memory.errors import FrameError, SourceError, first_line
 
 _LEAST_POINTS = 10
@@ -25,7 +25,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> ImportedMap:
-    """Return the things that masks make of the model's points. Raises `SourceError`."""
+    """Return the objects that masks make of the model's points. Raises `SourceError`."""
     from pycolmap import Reconstruction
 
     model = _model(path)
@@ -42,16 +42,16 @@ def read(path: Path) -> ImportedMap:
             continue
         _vote(image, mask, votes)
     owners = {point: c.most_common(1)[0][0] for point, c in votes.items()}
-    things = []
+    objects = []
     for number in sorted({n for n in owners.values() if n > 0}):
         mine = [found.points3D[k] for k, n in sorted(owners.items()) if n == number]
         if len(mine) >= _LEAST_POINTS:
             points = np.array([p.xyz for p in mine], np.float32)
-            things.append(ImportedThing(str(number), None, points, np.array([p.color for p in mine], np.uint8)))
+            objects.append(ImportedObject(str(number), None, points, np.array([p.color for p in mine], np.uint8)))
     notes = ["the model has a unit of its own: list3r scale makes it metres"]
     if unmasked:
         notes.append(f"{unmasked} of {len(found.images)} pictures have no mask")
-    return ImportedMap("colmap", tuple(things), metric=False, notes=tuple(notes))
+    return ImportedMap("colmap", tuple(objects), metric=False, notes=tuple(notes))
 
 
 def _model(path: Path) -> Path | None:

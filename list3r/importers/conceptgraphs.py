@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from list3r.importers.base import ImportedMap, ImportedThing, box_surface, read_json_file, vector
+from list3r.importers.base import ImportedMap, ImportedObject, box_surface, read_json_file, vector
 from list3r.memory.errors import SourceError
 from list3r.memory.geometry import OrientedBox
 
@@ -30,15 +30,15 @@ def read(path: Path) -> ImportedMap:
     if file is None:
         raise SourceError(
             f"{path} is a pickle, which runs code when it is read; give obj_json_*.json, which ConceptGraphs writes "
-            "beside it (save_obj_json: true)"
+            "next to it (save_obj_json: true)"
         )
     content = read_json_file(file)
     if not isinstance(content, dict) or not content:
         raise SourceError(f"{file} holds no objects; is it of ConceptGraphs?")
-    things = tuple(_thing(file, key, entry) for key, entry in content.items())
+    objects = tuple(_object(file, key, entry) for key, entry in content.items())
     return ImportedMap(
         "conceptgraphs",
-        things,
+        objects,
         notes=(
             "objects are boxes along the axes of the map, rounded to centimetres: the file has neither their turn nor "
             "their points",
@@ -52,13 +52,13 @@ def _file(path: Path) -> Path | None:
     return path if path.name.startswith("obj_json") and path.suffix == ".json" else None
 
 
-def _thing(file: Path, key: str, entry: object) -> ImportedThing:
+def _object(file: Path, key: str, entry: object) -> ImportedObject:
     if not isinstance(entry, Mapping):
         raise SourceError(f"{file}: {key} is not an object; fix or remove it")
     center = vector(entry.get("bbox_center"), f"{file}: bbox_center of {key}")
     size = vector(entry.get("bbox_extent"), f"{file}: bbox_extent of {key}")
     points = box_surface(OrientedBox(center, np.maximum(np.abs(size), 0.01), np.eye(3)))
-    return ImportedThing(str(entry.get("id", key)), _tag(entry), points)
+    return ImportedObject(str(entry.get("id", key)), _tag(entry), points)
 
 
 def _tag(entry: Mapping[str, Any]) -> str | None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.layout import natural_key
-from list3r.importers.base import ImportedMap, ImportedThing, read_json_file
+from list3r.importers.base import ImportedMap, ImportedObject, read_json_file
 from list3r.importers.ply import points_of, read_vertices
 from list3r.memory.errors import SourceError
 
@@ -26,14 +26,14 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> ImportedMap:
     """Return the objects with their points. Raises `SourceError`."""
     files = sorted((path / "objects").glob("*.json"), key=lambda p: natural_key(p.name))
-    things = [_thing(file) for file in files]
-    left = sum(t is None for t in things)
+    objects = [_object(file) for file in files]
+    left = sum(t is None for t in objects)
     notes = [f"{left} objects without points were left out"] if left else []
     notes += ["floors and rooms were not read"] if (path / "rooms").is_dir() else []
-    return ImportedMap("hovsg", tuple(t for t in things if t is not None), notes=tuple(notes))
+    return ImportedMap("hovsg", tuple(t for t in objects if t is not None), notes=tuple(notes))
 
 
-def _thing(file: Path) -> ImportedThing | None:
+def _object(file: Path) -> ImportedObject | None:
     content = read_json_file(file)
     if not isinstance(content, dict):
         raise SourceError(f"{file} is not an object of HOV-SG; fix or remove it")
@@ -43,7 +43,7 @@ def _thing(file: Path) -> ImportedThing | None:
     points, rgb = points_of(cloud, read_vertices(cloud))
     name = content.get("name")
     label = name if isinstance(name, str) and name and not name.startswith("object_") else None
-    return ImportedThing(str(content.get("object_id", file.stem)), label, points, rgb, _embedding(content))
+    return ImportedObject(str(content.get("object_id", file.stem)), label, points, rgb, _embedding(content))
 
 
 def _embedding(content: dict[str, Any]) -> NDArray[np.float32] | None:

@@ -1,8 +1,8 @@
 """Scene graphs of Hydra and Khronos: the JSON of spark-dsg (`dsg.json`).
 
-Nodes carry `attributes` of a `type`; objects are those of `ObjectNodeAttributes` and its kin, with `name`,
-`semantic_label`, `bounding_box` and the numbers of the mesh's vertices. Boxes have `dimensions` since version 1.0.3 and
-`min`, `max` before; where the file holds the mesh, things get its points.
+Nodes have `attributes` of a `type`; objects have `ObjectNodeAttributes` or a kind of it, with `name`, `semantic_label`,
+`bounding_box` and the numbers of the mesh's vertices. Boxes have `dimensions` since version 1.0.3 and `min`, `max`
+before; where the file holds the mesh, objects get its points.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.importers.base import ImportedMap, ImportedThing, box_surface, read_json_file, vector
+from list3r.importers.base import ImportedMap, ImportedObject, box_surface, read_json_file, vector
 from list3r.memory.errors import SourceError
 from list3r.memory.geometry import OrientedBox
 
@@ -38,17 +38,17 @@ def read(path: Path) -> ImportedMap:
     content = read_json_file(path)
     labels, mesh = _labels(content), _mesh(content)
     nodes = [n for n in content["nodes"] if _kind(n) in _OBJECTS]
-    found = [_thing(path, node, labels, mesh) for node in nodes]
-    things = tuple(t for t in found if t is not None)
+    found = [_object(path, node, labels, mesh) for node in nodes]
+    objects = tuple(t for t in found if t is not None)
     notes = []
-    if len(things) < len(found):
-        notes.append(f"{len(found) - len(things)} objects without a valid box were left out")
+    if len(objects) < len(found):
+        notes.append(f"{len(found) - len(objects)} objects without a valid box were left out")
     if mesh is None:
         notes.append("the file holds no mesh: objects are boxes")
     others = len(content["nodes"]) - len(nodes)
     if others:
         notes.append(f"{others} nodes that are not objects (places, rooms, agents) were not read")
-    return ImportedMap("hydra", things, notes=tuple(notes))
+    return ImportedMap("hydra", objects, notes=tuple(notes))
 
 
 def _kind(node: object) -> object:
@@ -79,9 +79,9 @@ def _mesh(content: Mapping[str, Any]) -> NDArray[np.float32] | None:
     return points if points.ndim == 2 and points.shape[1] == 3 and len(points) else None
 
 
-def _thing(
+def _object(
     path: Path, node: Mapping[str, Any], labels: Mapping[int, str], mesh: NDArray[np.float32] | None
-) -> ImportedThing | None:
+) -> ImportedObject | None:
     attributes, number = node["attributes"], node.get("id")
     where = f"{path}: node {number}"
     label = _label(attributes, labels)
@@ -89,11 +89,11 @@ def _thing(
     points = _points(attributes, mesh)
     if points is None and box is None:
         return None
-    return ImportedThing(symbol(number), label, box_surface(box) if points is None else points)  # type: ignore[arg-type]
+    return ImportedObject(symbol(number), label, box_surface(box) if points is None else points)  # type: ignore[arg-type]
 
 
 def _label(attributes: Mapping[str, Any], labels: Mapping[int, str]) -> str | None:
-    """Return the name of a thing or of its class; "class 7" where only the number is said."""
+    """Return the name of an object or of its class; "class 7" where only the number is said."""
     name, number = attributes.get("name"), attributes.get("semantic_label")
     if isinstance(name, str) and name and not name.endswith(")"):
         return name

@@ -1,4 +1,4 @@
-"""Point clouds with a number of the thing at each point, such as nerfstudio's exports with masks: a PLY file.
+"""Point clouds with a number of the object at each point, such as nerfstudio's exports with masks: a PLY file.
 
 The number is a property named `instance`, `instance_id`, `object_id`, `objectId`, `segment` or `id`; 0 or less is
 nothing.
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.importers.base import ImportedMap, ImportedThing
+from list3r.importers.base import ImportedMap, ImportedObject
 from list3r.importers.ply import points_of, read_vertices
 from list3r.memory.errors import SourceError
 
@@ -23,19 +23,19 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> ImportedMap:
-    """Return the things of the cloud. Raises `SourceError` for a cloud that names none."""
+    """Return the objects of the cloud. Raises `SourceError` for a cloud that names none."""
     rows = read_vertices(path)
     points, rgb = points_of(path, rows)
     key = next((k for k in rows if k.lower() in _NAMES), None)
     if key is None:
         raise SourceError(
-            f"{path} does not say which point belongs to which thing (a property {', '.join(_NAMES)}); a cloud without "
-            "things is for `list3r eval cloud`"
+            f"{path} does not say which object a point belongs to (a property {', '.join(_NAMES)}); a cloud without "
+            "objects is for `list3r eval cloud`"
         )
     numbers = rows[key].astype(np.int64)
     good = np.isfinite(points).all(axis=1)
-    things = []
+    objects = []
     for number in np.unique(numbers[good & (numbers > 0)]).tolist():
         mine = good & (numbers == number)
-        things.append(ImportedThing(str(number), None, points[mine], None if rgb is None else rgb[mine]))
-    return ImportedMap("ply", tuple(things))
+        objects.append(ImportedObject(str(number), None, points[mine], None if rgb is None else rgb[mine]))
+    return ImportedMap("ply", tuple(objects))

@@ -16,7 +16,7 @@ FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], ImportedMap]]]
     "colmap": (colmap_masks.matches, colmap_masks.read),
     "ply": (labelled_cloud.matches, labelled_cloud.read),
 }
-"""By name: whether a path is such a map, and what reads it; tried in order."""
+"""By name: whether a path is such a map, and its reader; tried in order."""
 
 
 def read_map(path: Path, name: str = "auto") -> ImportedMap:
@@ -27,7 +27,7 @@ def read_map(path: Path, name: str = "auto") -> ImportedMap:
     for kind, (matches, read) in FORMATS.items():
         if name == kind or (name == "auto" and matches(path)):
             found = read(path)
-            if not found.things:
-                raise SourceError(f"{path} holds no things ({'; '.join(found.notes) or kind})")
+            if not found.objects:
+                raise SourceError(f"{path} holds no objects ({'; '.join(found.notes) or kind})")
             return found
     raise SourceError(f"{path} is not a map of {', '.join(FORMATS)}; predictions of networks go through `precomputed`")

@@ -1,4 +1,4 @@
-"""The borders of the local instance library (paper 3.1, A.1): what a discoverer and a tracker are."""
+"""The interfaces of the local instance library (paper 3.1, A.1): discoverer and tracker."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Proposals:
     """Plane (n, d) with n . p + d = 0 in camera coordinates of the anchor, n towards the camera, for candidates that
     are one flat surface; NaN for the others. Shape (N, 4)."""
     identity: NDArray[np.int64] | None = None
-    """The thing each candidate is a view of, where the discoverer knows it across anchors. Shape (N,)."""
+    """The object each candidate is a view of, where the discoverer knows it across anchors. Shape (N,)."""
     structure: NDArray[np.bool_] | None = None
     """Candidates that bound the room (floor, wall, ceiling), where the discoverer knows. Shape (N,)."""
     names: tuple[str, ...] | None = None
     """Class name of each candidate, where the discoverer has names. N of them."""
     whole: NDArray[np.float32] | None = None
-    """Calibrated probability that each candidate is one thing and all of it, where the discoverer knows. Shape (N,)."""
+    """Calibrated probability that each candidate is one whole object, where the discoverer knows. Shape (N,)."""
     named: tuple[tuple[tuple[str, float], ...], ...] | None = None
     """Names that each candidate may have, with their probabilities over all anchors, where it knows. N of them."""
-    scraps: Proposals | None = None
-    """What is too seldom one thing to be a candidate, with `identity` and `whole`, where the discoverer tells."""
+    low_confidence: Proposals | None = None
+    """Segments too uncertain to be candidates, with `identity` and `whole`, where the discoverer reports them."""
 
 
 class Discoverer(Protocol):
@@ -52,7 +52,7 @@ class Discoverer(Protocol):
         ...
 
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
-        """Propose masks on the frame at `position` of the chunk; its neighbours may be looked at too."""
+        """Propose masks on the frame at `position` of the chunk; it may also use the neighbouring frames."""
         ...
 
 
@@ -66,5 +66,5 @@ class Tracker(Protocol):
         proposals: Sequence[Proposals],
         feature_space: str,
     ) -> LocalLibrary:
-        """Propagate all candidates over the chunk, join those that are one thing, drop unstable tracks."""
+        """Propagate all candidates over the chunk, join those that are one object, drop unstable tracks."""
         ...

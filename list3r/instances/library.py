@@ -12,9 +12,9 @@ from list3r.instances.base import Discoverer, Proposals, Tracker
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.settings import InstanceSettings
+from list3r.instances.tracking.low_confidence import low_confidence_instances
 from list3r.instances.tracking.movers import with_movers
 from list3r.instances.tracking.reprojection import ReprojectionTracker
-from list3r.instances.tracking.scraps import scrap_instances
 from list3r.memory.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
@@ -28,11 +28,11 @@ def build_library(
     discoverer: Discoverer | None = None,
     tracker: Tracker | None = None,
 ) -> LocalLibrary:
-    """Find the things of a chunk and follow them through it.
+    """Find the objects of a chunk and follow them through it.
 
-    `frames` are the chunk's frames in the order of the reconstruction. Without a discoverer and a tracker those
-    are used that need no weights from elsewhere. What the reconstruction found to move of its own is added as
-    instances that are `dynamic`; the others do not see it, for it has no depth there.
+    `frames` are the chunk's frames in the order of the reconstruction. The default discoverer and tracker need no
+    downloaded weights. Moving objects of the reconstruction are added as `dynamic` instances; discovery does not see
+    them, as the reconstruction has no depth there.
     """
     settings = settings or InstanceSettings()
     discoverer = discoverer or LearnedDiscoverer(settings)
@@ -43,8 +43,8 @@ def build_library(
         prompts = [select_prompts(p, settings) for p in proposals]
         library = tracker(frames, reconstruction, prompts, discoverer.feature_space)
         library = with_movers(library, frames, reconstruction, settings.movers)
-        scraps = [p.scraps for p in proposals if p.scraps is not None]
-        return replace(library, scraps=scrap_instances(views, scraps, settings, len(library.instances)))
+        unsure = [p.low_confidence for p in proposals if p.low_confidence is not None]
+        return replace(library, scraps=low_confidence_instances(views, unsure, settings, len(library.instances)))
     finally:
         forget_views()
 

@@ -1,4 +1,4 @@
-"""Pictures for `--debug`: masks with ids on frames, tracks over time, and what edges between chunks stand on."""
+"""Pictures for `--debug`: masks with ids on frames, tracks over time, and the support of edges between chunks."""
 
 from __future__ import annotations
 
@@ -84,10 +84,10 @@ def draw_tracks(library: LocalLibrary, frame_indices: NDArray[np.int64]) -> NDAr
 def write_support(
     measured: MeasuredEdge, keyframes: Iterable[Keyframe], camera: Camera, out_dir: Path, name: str | None = None
 ) -> Path:
-    """Write what an edge stands on to `out_dir`/edges/`name`.png (U-V for chunks U and V); returns the file.
+    """Write the support of an edge to `out_dir`/edges/`name`.png (U-V for chunks U and V); returns the file.
 
-    `keyframes` are those of both chunks; the picture is the shared one in which most was removed, then most kept. Where
-    none of them is shared or has a picture, a grey one takes its place.
+    `keyframes` are those of both chunks; the shared one with most removed points, then most kept, is drawn; a grey one
+    where none is shared or has a picture.
     """
     support = measured.support
     pictures = {k.frame_index: k.jpeg for k in keyframes if k.jpeg}
@@ -108,8 +108,8 @@ def write_support(
 def draw_support(frame_color: NDArray[np.uint8], measured: MeasuredEdge, frame: int) -> NDArray[np.uint8]:
     """An overlap frame three times, as in the paper's figure of its supports. RGB, shape (h, w, 3).
 
-    Left the frame; in the middle yellow what confidence alone would take; right cyan what the edge stands on and red
-    what was removed because it moves. `frame` is the Frame.index of `frame_color` (H, W, 3).
+    Left the frame; in the middle yellow the choice by confidence alone; right cyan the support of the edge and red
+    points removed as moving. `frame` is the Frame.index of `frame_color` (H, W, 3).
     """
     support = measured.support
     here = support.frame == frame

@@ -41,7 +41,7 @@ def make_discoverer(
 ) -> Discoverer:
     """The discoverer of that name; `folders` are (part/model, folder of its weights). Raises `OptionError`.
 
-    Networks are loaded once in a process; the learned discoverer is made anew, for it holds on to its chunk.
+    Networks are loaded once in a process; the learned discoverer is made for each chunk, as it caches its chunk.
     """
     where = dict(folders)
     found: Discoverer
@@ -64,7 +64,7 @@ def make_discoverer(
     return WithAppearance(found, _appearance(features, where[f"features/{features}"], device))
 
 
-def make_frame_look(features: str, folders: tuple[tuple[str, str], ...], device: str) -> FrameDescriptor | None:
+def make_frame_descriptor(features: str, folders: tuple[tuple[str, str], ...], device: str) -> FrameDescriptor | None:
     """What describes whole frames by the network of that name, the one that describes things; None where it is none.
 
     Raises `OptionError`.

@@ -1,4 +1,4 @@
-"""Cannot-link evidence: pairs that are two things because one frame shows both (paper 3.1)."""
+"""Cannot-link evidence: pairs that are two objects because one frame shows both (paper 3.1)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from list3r.memory.records import LocalInstance
 WELL_VISIBLE = 0.3
 """Share of an instance's support that must be seen for its mask to count."""
 TOUCHING_M = 0.03
-"""Things nearer than this may be pieces of one, unless a surface parts them."""
+"""Objects nearer than this may be pieces of one, unless a surface parts them."""
 PIECE_M = 0.25
-"""Instances smaller than this in every direction are small things."""
+"""Instances smaller than this in every direction are small objects."""
 COLOR_DIFFERENCE = 12.0
-"""From this on two flat things in one plane are a sheet and what it lies on."""
+"""From this on two flat objects in one plane are a sheet and its support."""
 ROOM_M = 0.6
 """Pieces of one piece of furniture are seldom farther apart than this."""
 
 
 def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: float) -> NDArray[np.int32]:
-    """Pairs of local ids seen side by side in at least `frames` frames and not possibly pieces of one. Shape (P, 2).
+    """Pairs of local ids seen side by side in at least `frames` frames that cannot be pieces of one. Shape (P, 2).
 
-    An over-segmented thing looks just like two things side by side. So a pair only counts when a surface parts it
-    (one stands on the other), when they lie in one plane and differ in colour, when both are small and apart, or
-    when they are far apart and not in one plane.
+    An over-segmented object looks just like two objects side by side. So a pair only counts when a surface parts it
+    (one is on the other), when they are in one plane and differ in colour, when both are small and apart, or when they
+    are far apart and not in one plane.
     """
     well = [_well_visible(instance) for instance in instances]
     parts = [_Part.of(instance) for instance in instances]
@@ -37,14 +37,14 @@ def cannot_link_pairs(instances: Sequence[LocalInstance], frames: int, unit: flo
         (a, b)
         for a in range(len(instances))
         for b in range(a + 1, len(instances))
-        if len(well[a] & well[b]) >= frames and _two_things(parts[a], parts[b], unit)
+        if len(well[a] & well[b]) >= frames and _two_objects(parts[a], parts[b], unit)
     ]
     return np.array(pairs, np.int32).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
 class _Part:
-    """An instance with what every comparison of it needs."""
+    """An instance with values that every comparison needs."""
 
     instance: LocalInstance
     low: NDArray[np.float32]
@@ -72,13 +72,13 @@ def _well_visible(instance: LocalInstance) -> set[int]:
     return set(instance.track.frames[rows].tolist())
 
 
-def _two_things(one: _Part, two: _Part, unit: float) -> bool:
+def _two_objects(one: _Part, two: _Part, unit: float) -> bool:
     a, b = one.instance, two.instance
     if a.plane is not None and b.plane is not None and (_on_plane(a, b, unit) or _on_plane(b, a, unit)):
         return _color_difference(a, b) > COLOR_DIFFERENCE
     gap = _gap(one, two, 1.1 * ROOM_M * unit) / unit
     if gap < TOUCHING_M:
-        return _stands_on(a, b, unit) or _stands_on(b, a, unit)
+        return _rests_on(a, b, unit) or _rests_on(b, a, unit)
     return (one.small(unit) and two.small(unit)) or gap > ROOM_M or a.structure or b.structure
 
 
@@ -97,12 +97,12 @@ def _gap(a: _Part, b: _Part, far: float) -> float:
 
 
 def _on_plane(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
-    """True where the flat a lies in the plane of b."""
+    """True where the flat a is in the plane of b."""
     assert b.plane is not None
     return bool(np.median(np.abs(a.support.points @ b.plane[:3] + b.plane[3])) < 0.05 * unit)
 
 
-def _stands_on(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
+def _rests_on(a: LocalInstance, b: LocalInstance, unit: float) -> bool:
     """True where a is all on the open side of the flat b and rises well from it."""
     if b.plane is None:
         return False

@@ -31,7 +31,7 @@ class AnchorViewSettings:
     step: int = 2
     """Every how many of them."""
     max_sigma_m: float = 0.05
-    """Depth noisier than this (5 m away with the default noise) shows no things and is left out,"""
+    """Depth noisier than this (5 m away with the default noise) shows no objects and is left out,"""
     max_computed: float = 0.025
     """unless it was computed and its deviation is less than this share of depth: walls far off still bound the room."""
     noise: DepthNoiseSettings = field(default_factory=DepthNoiseSettings)
@@ -39,13 +39,12 @@ class AnchorViewSettings:
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """How the fused chunk is cut into things."""
+    """How the fused chunk is cut into objects."""
 
     voxel_m: float = 0.016
-    """Grain of the chunk's cloud: coarser than what the networks learned from, and better by it (research/discovery
-    0176)."""
+    """Voxel edge of the chunk's cloud: coarser than in training, with better results (research/discovery 0176)."""
     computed_voxel_m: float = 0.01
-    """The same where no sensor measured depth: larger voxels lose things there."""
+    """The same where no sensor measured depth: larger voxels lose objects there."""
 
     def grain_m(self, *, sensed: bool) -> float:
         """Return the size of voxels, metres, for depth that a sensor measured or that was computed."""
@@ -81,20 +80,20 @@ class CandidateSettings:
     min_score: float = 0.3
     """Class probability (or predicted quality) times the mean probability inside the mask."""
     max_overlap: float = 0.7
-    """A mask of which a larger share lies under better ones is redundant (the ratio that panoptic networks use)."""
+    """A mask with a larger share under better ones is redundant (the ratio that panoptic networks use)."""
     min_area_share: float = 0.0002
     """Of the picture: 60 pixels of 640 x 480."""
     flat_rms: float = 2.0
-    """A mask is flat when its points lie off their best plane by less than this many deviations of the noise."""
+    """A mask is flat when its points are off their best plane by less than this many deviations of the noise."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.max_overlap <= 1.0:
-            raise OptionError(f"max overlap {self.max_overlap} must lie in (0, 1]")
+            raise OptionError(f"max overlap {self.max_overlap} must be in (0, 1]")
 
 
 @dataclass(frozen=True)
 class SamMaskSettings:
-    """How the picture is prompted and what is kept."""
+    """Prompts of a picture, and which masks are kept."""
 
     points_per_side: int = 24
     """Prompts along each side of the picture (32 in the authors' generator, for larger pictures)."""
@@ -115,39 +114,39 @@ class SamMaskSettings:
 
 @dataclass(frozen=True)
 class VideoTrackerSettings:
-    """How things are followed and handed over."""
+    """How objects are followed and handed over."""
 
     most_live: int = 60
-    """Things followed at one time; cost and memory of a frame grow with each."""
+    """Objects followed at one time; cost and memory of a frame grow with each."""
     same_iou: float = 0.5
-    """A candidate that overlaps a followed thing's mask by this is a view of that thing."""
+    """A candidate that overlaps a followed object's mask by this is a view of that object."""
     covered: float = 0.7
-    """A candidate of which this share is followed already, by whatever, is no new thing."""
+    """A candidate is no new object when this share of it is followed already."""
 
     def __post_init__(self) -> None:
         if self.most_live < 1:
-            raise OptionError(f"at least 1 thing must be followed, not {self.most_live}")
+            raise OptionError(f"at least 1 object must be followed, not {self.most_live}")
 
 
 @dataclass(frozen=True)
 class MoverInstanceSettings:
-    """What is kept of a thing that moves."""
+    """Views and points kept of a moving object."""
 
     whole: float = 0.5
     """Share of its largest mask that a view must have to show where it was last."""
-    beside: int = 2
+    neighbours: int = 2
     """Frames on either side of that view whose points are added, moved to where it was then."""
     rest_m: float = 0.05
     """Places this near to the last one are one place of rest."""
     support_points: int = 3000
     cannot_link_frames: int = 3
-    """Frames in which a pair must be seen side by side to be two things."""
+    """Frames in which a pair must be seen side by side to be two objects."""
     confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
 
 
 @dataclass(frozen=True)
-class ScrapSettings:
-    """What is kept of things that are not listed."""
+class LowConfidenceSettings:
+    """Segments kept of objects that are not listed."""
 
     least_anchors: int = 2
     """Anchors that must see it, where a chunk has so many."""
@@ -168,10 +167,10 @@ class InstanceSettings:
     segment: SegmentSettings = field(default_factory=SegmentSettings)
     track: MaskTrackSettings = field(default_factory=MaskTrackSettings)
     movers: MoverInstanceSettings = field(default_factory=MoverInstanceSettings)
-    scraps: ScrapSettings = field(default_factory=ScrapSettings)
+    low_confidence: LowConfidenceSettings = field(default_factory=LowConfidenceSettings)
 
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
-    """Of networks that look for things."""
+    """Of networks that detect objects."""
     sam: SamMaskSettings = field(default_factory=SamMaskSettings)
     video_tracker: VideoTrackerSettings = field(default_factory=VideoTrackerSettings)
 

@@ -110,7 +110,7 @@ def make_service(catalog: Catalog, secret: str, limits: ServiceLimits | None = N
 
 
 def from_environment() -> Application:
-    """Return the application of a process of a service; catalogue and secret stand in its environment."""
+    """Return the application of a process of a service; catalogue and secret come from its environment."""
     limits = ServiceLimits(request_s=float(os.environ[TIMEOUT_VARIABLE]))
     catalog = Catalog.open(os.environ[CATALOG_VARIABLE], limits.connections)
     return make_service(catalog, os.environ[SECRET_VARIABLE], limits)
@@ -137,7 +137,7 @@ class _State:
 
 
 class _Questions:
-    """What the catalogue is asked, one method a path."""
+    """Questions to the catalogue, one method a path."""
 
     def __init__(self, catalog: Catalog, limits: ServiceLimits) -> None:
         self._catalog, self._limits = catalog, limits
@@ -152,21 +152,21 @@ class _Questions:
         return _answer([asdict(self._catalog.memory(name))])
 
     def find(self, text: Text, page: Paged, which: Filtered, memory: Maybe = None) -> dict[str, Any]:
-        """Things by a phrase, in one memory or over all."""
+        """Instances by a phrase, in one memory or over all."""
         found = self._catalog.find(text, memory, k=self._wanted(page), filters=which.filters())
         return self._paged(found, page, found.notes, **found.facts())
 
     def nearest(
         self, name: str, page: Paged, which: Filtered, at: Annotated[Point, Depends()], id: InstanceId = None
     ) -> dict[str, Any]:
-        """Things nearest to a point or an instance."""
+        """Instances nearest to a point or an instance."""
         point: Any = None if at == Point() else (at.x, at.y, at.z)
         k = self._wanted(page)
         found = self._catalog.nearest(name, point=point, instance_id=id, k=k, filters=which.filters())
         return self._paged(found, page, found.notes)
 
     def within(self, name: str, page: Paged, which: Filtered, bounds: Annotated[Bounds, Depends()]) -> dict[str, Any]:
-        """Things in a box or a sphere."""
+        """Instances in a box or a sphere."""
         sides: dict[str, Any] = asdict(bounds)
         found = self._catalog.within(name, **sides, filters=which.filters())
         return self._paged(found, page, found.notes, total=len(found))
@@ -174,13 +174,13 @@ class _Questions:
     def similar(
         self, name: str, id: Instance, page: Paged, which: Filtered, everywhere: bool = False
     ) -> dict[str, Any]:
-        """Things that look like one of a memory."""
+        """Instances that look like one of a memory."""
         k = self._wanted(page)
         found = self._catalog.similar(name, instance_id=id, anywhere=everywhere, k=k, filters=which.filters())
         return self._paged(found, page, found.notes)
 
     def alike(self, body: Vector) -> dict[str, Any]:
-        """Things whose vectors are like one, over all memories or in one."""
+        """Instances whose vectors are like one, over all memories or in one."""
         page, anywhere = Page(limit=body.limit), body.memory is None
         k = self._wanted(page)
         found = self._catalog.similar(body.memory, vector=body.vector, space=body.space, anywhere=anywhere, k=k)
@@ -195,14 +195,14 @@ class _Questions:
         return self._paged(found, page, found.notes)
 
     def _wanted(self, page: Page) -> int:
-        """Return how many answers are to be found for a page, and one more: it tells whether another page follows."""
+        """Return the number of answers for a page, and one more: it shows whether another page follows."""
         return min(page.offset + self._limit(page) + 1, MOST_ANSWERS)
 
     def _limit(self, page: Page) -> int:
         return min(page.limit, self._limits.answers)
 
     def _paged(self, found: Sequence[Any], page: Page, notes: Iterable[str] = (), **facts: Any) -> dict[str, Any]:
-        """Return one page of what was found; `next` is the offset of the next one, null at the end."""
+        """Return one page of the answers; `next` is the offset of the next one, null at the end."""
         end = page.offset + self._limit(page)
         following = end if len(found) > end else None
         return _answer([asdict(m) for m in found[page.offset : end]], notes, next=following, **facts)
@@ -213,7 +213,7 @@ def _answer(matches: Sequence[Any], notes: Iterable[str] = (), **facts: Any) -> 
 
 
 async def _explained(request: Request, error: Exception) -> JSONResponse:
-    """What the user can fix is 400, what is not there 404, and a catalogue that does not answer 503."""
+    """The user's errors are 400, absent resources 404, and a catalogue that does not answer 503."""
     unknown = isinstance(error, UnknownIdError | UnknownMemoryError)
     status = 404 if unknown else 503 if isinstance(error, CatalogError) else 400
     return JSONResponse(error_answer(status, type(error).__name__, str(error)), status)

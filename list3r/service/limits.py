@@ -1,4 +1,4 @@
-"""What every request passes before it is answered: a token, a bound on its size and its time, and a count."""
+"""Checks of every request: a token, a bound on its size and its time, and a count."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Send = Callable[[Message], Awaitable[None]]
 Application = Callable[[Message, Receive, Send], Awaitable[None]]
 
 OPEN_PATHS = frozenset(("/health",))
-"""Answered without a token, and once a connection; they say nothing of what is catalogued."""
+"""Paths answered without a token, and once a connection; they reveal nothing of the catalogue."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ServiceLimits:
     at_once: int = 64
     """Requests that one process answers; one that is still arriving does not count."""
     open_at_once: int = 512
-    """Connections of one process; beyond that those which have waited longest make room."""
+    """Connections of one process; beyond that the longest waiting are closed."""
     of_one_address: int = 256
     """Connections of one address to one process."""
     answers: int = 200
@@ -73,7 +73,7 @@ class Metrics:
 
 
 class Guard:
-    """Wraps an application: what is not allowed, too large or too slow is answered here."""
+    """Wraps an application: requests not allowed, too large or too slow are refused here."""
 
     def __init__(self, inner: Application, secret: str, limits: ServiceLimits, metrics: Metrics) -> None:
         self._inner, self._secret, self._limits, self._metrics = inner, secret, limits, metrics
@@ -183,7 +183,7 @@ class BoundedProtocol(H11Protocol):
         self.address = _network(self.client[0]) if self.client else ""
         self.waits_since = self.loop.time()
         self._deadline = self.loop.call_later(self._limits.request_s, self.cut)
-        self.loop.call_later(0.0, self._make_room)  # once what has arrived on other connections is read
+        self.loop.call_later(0.0, self._make_room)  # after reading the data of other connections
 
     def handle_events(self) -> None:
         """Read; from the headers of a request on, there is time for its body and answer, and to take that."""
@@ -219,7 +219,7 @@ class BoundedProtocol(H11Protocol):
         self._deadline = self.loop.call_later(seconds, self.cut)
 
     def _make_room(self) -> None:
-        """Cut what has waited longest while there are too many, of the addresses that have most connections."""
+        """Close the longest waiting connections of the addresses with most, while there are too many."""
         while True:
             held = cast("set[BoundedProtocol]", self.connections)
             counts = Counter(c.address for c in held)
@@ -227,7 +227,7 @@ class BoundedProtocol(H11Protocol):
             if not crowded and len(held) <= self._limits.open_at_once:
                 return
             waiting = [c for c in held if c.waits and (c.address == self.address or not crowded)]
-            if not waiting:  # all are being answered, and `Guard` bounds those
+            if not waiting:  # all are being answered, which `Guard` bounds
                 return
             min(waiting, key=lambda c: (-counts[c.address], c.waits_since)).cut()
 

@@ -43,7 +43,7 @@ def serve(
 
     Raises `OptionError` where the port is taken, `CatalogError` where the catalogue cannot be opened.
     """
-    Catalog.open(catalog, make=False).close()  # what is wrong with it is said here, and once
+    Catalog.open(catalog, make=False).close()  # its errors are reported here, and once
     os.environ |= {CATALOG_VARIABLE: catalog, SECRET_VARIABLE: secret, TIMEOUT_VARIABLE: str(limits.request_s)}
     listener = _listen(address.host, address.port)
     config = server_config("list3r.service.app:from_environment", limits, factory=True, workers=address.workers)

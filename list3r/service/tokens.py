@@ -13,7 +13,7 @@ SHORTEST_SECRET = 16
 
 
 def make_token(secret: str, hours: float, now_s: float | None = None) -> str:
-    """Return a token that holds for some hours. Raises `OptionError` for a secret that keeps nobody out."""
+    """Return a token that holds for some hours. Raises `OptionError` for a weak secret."""
     if len(secret) < SHORTEST_SECRET:
         raise OptionError(f"the secret is too short to be safe; give at least {SHORTEST_SECRET} characters")
     if not 0 < hours <= 24 * 366:

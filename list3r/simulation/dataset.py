@@ -1,4 +1,4 @@
-"""A simulated walk as a folder in the TUM RGB-D layout, with the truth beside it."""
+"""A simulated walk as a folder in the TUM RGB-D layout, with the truth next to it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.rendering.shading import Lighting
 from list3r.simulation.walk import PathSettings, camera_path
-from list3r.simulation.worlds.things import MovingThing
+from list3r.simulation.worlds.objects import MovingObject
 from list3r.simulation.worlds.truth import world_truth
 from list3r.simulation.worlds.world import SimulatedWorld, make_world
 
@@ -32,7 +32,7 @@ _BATCH = 12
 
 @dataclass(frozen=True)
 class WalkSettings:
-    """A walk through two furnished rooms. Subclasses film other worlds, other ways or things that move."""
+    """A walk through two furnished rooms. Subclasses film other worlds, other ways or objects that move."""
 
     seed: int = 0
     """Decides the world."""
@@ -50,7 +50,7 @@ class WalkSettings:
     sensor: SensorSettings = field(default_factory=SensorSettings)
     lighting: Lighting = field(default_factory=Lighting)
     write_ids: bool = False
-    """Also write `ids/`: the id of the thing in every pixel, 16 bit."""
+    """Also write `ids/`: the id of the object in every pixel, 16 bit."""
 
     def __post_init__(self) -> None:
         if self.frames is not None and self.frames < 2:
@@ -79,12 +79,12 @@ class WalkSettings:
             raise OptionError(f"start {self.start} leaves nothing of a walk of {len(time_s)} frames")
         return time_s[self.start :], poses[self.start :]
 
-    def movers(self) -> tuple[MovingThing, ...]:
-        """Return what moves while it is filmed, with its pose in each of the frames to be written."""
+    def movers(self) -> tuple[MovingObject, ...]:
+        """Return the moving objects, with their poses in the frames to be written."""
         return ()
 
     def truth(self, seen: dict[int, dict[str, int]]) -> dict[str, Any]:
-        """Return the content of `truth.json`; `seen` has the counts of each thing's id, as `world_truth` takes them."""
+        """Return the content of `truth.json`; `seen` has the counts of each object id, see `world_truth`."""
         return world_truth(self.world(), seen)
 
 
@@ -135,17 +135,17 @@ class _Writer:
         self._settings, self._root = settings, root
         self._time_s, self._poses = settings.poses()
         self._movers = settings.movers()
-        things = [m.thing for m in self._movers]
-        self._renderer = Renderer(settings.world(), settings.camera(), things, settings.lighting)
+        objects = [m.obj for m in self._movers]
+        self._renderer = Renderer(settings.world(), settings.camera(), objects, settings.lighting)
         self._seed = settings.seed if settings.walk_seed is None else settings.walk_seed
 
     def write_span(self, span: tuple[int, int]) -> list[dict[int, int]]:
-        """Write the frames at positions [start, stop); returns the areas of the things in each."""
+        """Write the frames at positions [start, stop); returns the areas of the objects in each."""
         return [self._write(position) for position in range(*span)]
 
     def _write(self, position: int) -> dict[int, int]:
         for mover in self._movers:
-            self._renderer.scene.place(mover.thing.id, mover.T_world_object[position])
+            self._renderer.scene.place(mover.obj.id, mover.T_world_object[position])
         frame = self._renderer.render(self._poses[position])
         sensed = sense(
             frame, self._settings.sensor, self._seed, position + self._settings.start, float(self._time_s[position])
@@ -183,8 +183,8 @@ def _save(path: Path, image: NDArray[Any], options: list[int]) -> None:
 
 def _count(seen: dict[int, dict[str, int]], areas: Iterable[dict[int, int]]) -> None:
     for frame in areas:
-        for thing, area in frame.items():
-            entry = seen.setdefault(thing, {"frames": 0, "largest_px": 0})
+        for obj, area in frame.items():
+            entry = seen.setdefault(obj, {"frames": 0, "largest_px": 0})
             entry["frames"] += 1
             entry["largest_px"] = max(entry["largest_px"], area)
 

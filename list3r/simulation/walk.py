@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PathSettings:
-    """How the camera moves. The limits are those of a person who films a room and means to."""
+    """How the camera moves. The limits are those of a person who films a room on purpose."""
 
     fps: float = 12.0
     speed_m_s: float = 0.5
@@ -44,8 +44,8 @@ def camera_path(
 ) -> tuple[Array, Array]:
     """Times and poses of a walk past the stops.
 
-    Returns seconds (F,) and T_world_cam (F, 4, 4), camera axes x right, y down, z forward. None for `frames` takes
-    what the whole round needs; fewer cut it short, more walk it slower.
+    Returns seconds (F,) and T_world_cam (F, 4, 4), camera axes x right, y down, z forward. None for `frames` takes as
+    many as the whole round needs; fewer cut it short, more walk it slower.
     """
     clock, eye, yaw, pitch = _path(stops, settings)
     needed = int(np.ceil(clock[-1] * settings.fps)) + 1
@@ -57,10 +57,10 @@ def camera_path(
     position = position + settings.sway_m * _sway(rng, time_s, 3)
     tilt = np.deg2rad(settings.sway_deg) * _sway(rng, time_s, 3)
     heading = np.interp(moment, clock, yaw) + tilt[:, 0]
-    return time_s, look_poses(position, heading, np.interp(moment, clock, pitch) + tilt[:, 1], tilt[:, 2])
+    return time_s, viewing_poses(position, heading, np.interp(moment, clock, pitch) + tilt[:, 1], tilt[:, 2])
 
 
-def look_poses(position: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
+def viewing_poses(position: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
     """T_world_cam of cameras at `position` (F, 3) that look along yaw (from +x), pitch (up) and roll, radians."""
     forward = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
     right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=1)

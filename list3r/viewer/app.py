@@ -91,8 +91,8 @@ class Viewer:
             return read_world(before, changes)
 
     def show(self, **changed: Any) -> None:
-        """Change what is shown: fields of `ViewState`. Raises `List3rError`, and nothing changes, where the memory as
-        it was after a session cannot be read.
+        """Change what is shown: fields of `ViewState`. Raises `List3rError`, and nothing changes, where a past state of
+        the memory cannot be read.
         """
         with self._lock:
             before, wanted = self.state, replace(self.state, **changed)
@@ -112,7 +112,7 @@ class Viewer:
             self.draw()
 
     def draw(self) -> None:
-        """Draw everything and say what is selected."""
+        """Draw everything and describe the selection."""
         with self._lock, self.server.atomic():
             s, world, unit = self.state, self.world, self.world.unit
             self._layers.highlight(world, s.colors, s.selected, visible=s.points)
@@ -121,9 +121,9 @@ class Viewer:
             self._layers.changes(world, visible=s.colors == "changes")
             self._layers.clear("relations")
             if s.selected is not None:
-                self._tell(s.selected)
+                self._describe(s.selected)
             else:
-                self.panel.tell("Click a thing, or search for one.", None)
+                self.panel.describe("Click an instance, or search for one.", None)
         self._draw_points()
         for page in self._open_pages():
             page.names.draw(self.world, self.state.selected, visible=self.state.labels)
@@ -144,37 +144,37 @@ class Viewer:
         self._pages = {n: page for n, page in self._pages.items() if n in there}
         return list(self._pages.values())
 
-    def _tell(self, instance_id: int) -> None:
+    def _describe(self, instance_id: int) -> None:
         relations = list(self.memory.relations(subject=instance_id))
         self._layers.relations(self.world, instance_id, relations)
         try:
             picture = _enlarged(self.memory.picture(instance_id).crop())
         except List3rError:
             picture = None
-        self.panel.tell(described(self.memory, self.world, instance_id, relations), picture)
+        self.panel.describe(described(self.memory, self.world, instance_id, relations), picture)
 
     # ------------------------------------------------------------------ what a user does
 
     def find(self, text: str) -> list[int]:
-        """Search, select the best answer and look at it; the ids that answer. The panel says what was not found."""
+        """Search, select the best answer and look at it; returns the ids. The panel names words that were not found."""
         found = self.memory.find(text, 10)
         ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
         said = [str(x) for x in (found.counted, found.answer) if x is not None]
         self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join([*said, *found.notes]))
         if ids:
-            self.select(ids[0], look=True)
+            self.select(ids[0], turn=True)
         return ids
 
-    def select(self, instance_id: int | None, *, look: bool = False) -> None:
-        """Select an instance, and turn all cameras to it where `look`."""
+    def select(self, instance_id: int | None, *, turn: bool = False) -> None:
+        """Select an instance, and turn all cameras to it where `turn`."""
         self.show(selected=instance_id)
-        if look and instance_id in self.world.instances and instance_id is not None:
+        if turn and instance_id in self.world.instances and instance_id is not None:
             i = self.world.instances[instance_id]
             reach = max(float(np.linalg.norm(i.box.size)), 0.1)
             for client in self.server.get_clients().values():
                 away = client.camera.position - client.camera.look_at
                 away = away / max(float(np.linalg.norm(away)), 1e-9)
-                client.camera.position = i.center + 3.0 * reach * away  # takes what is looked at along
+                client.camera.position = i.center + 3.0 * reach * away  # moves the target along
                 client.camera.look_at = i.center
 
     def measure(self) -> None:
@@ -195,7 +195,7 @@ class Viewer:
             self._layers.camera(self.path, k, rgb, (camera.intrinsics[1], width, height), self.world.unit)
 
     def edit(self, change: Callable[[], Any]) -> None:
-        """Run one edit and show what it did, or why it was refused."""
+        """Run one edit and show its result, or why it was refused."""
         try:
             report = change()
         except List3rError as error:
@@ -232,7 +232,7 @@ class Viewer:
         names.draw(self.world, self.state.selected, visible=self.state.labels)
 
     def _follow(self, view: ViewState) -> None:
-        """Show what a link names, as far as this memory has it, and say what is left out."""
+        """Show the view of a link, as far as this memory has it, and name what is missing."""
         left_out = []
         if self._dropped:
             self._dropped = False
@@ -246,7 +246,7 @@ class Viewer:
             left_out.append(f"The link cannot be followed: {error}.")
         else:
             if view.selected != self.state.selected:
-                left_out.append(f"There is no thing {view.selected}, which the link names.")
+                left_out.append(f"There is no instance {view.selected}, which the link names.")
         self.panel.say(" ".join(left_out))
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:

@@ -16,12 +16,12 @@ from list3r.viewer.names import PageNames
 from list3r.viewer.world import ShownCloud, ShownWorld, close_by, color_of, colors, overview
 
 FINE = "/fine"
-"""What stands below this node is hidden while the camera of a slow page moves."""
+"""Nodes below this one are hidden while the camera of a slow page moves."""
 _BOX = 25
 """A box of thin lines takes as long to draw as this many points."""
 _POINT_M, _COARSE_M = 0.012, 0.03
 _MOVED_SHARE = 0.1
-"""The camera must move by this share of its distance to what it looks at before detail is drawn again."""
+"""The camera must move by this share of its distance to its target before detail is drawn again."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class CloudSettings:
     overview_points: int = 1_500_000
     """Points that are always there, at most."""
     detail_points: int = 1_500_000
-    """Points that come besides near the camera, at most."""
+    """Further points near the camera, at most."""
     rest_s: float = 0.5
     """All that is drawn while the camera rests takes a page no longer than this."""
     moving_s: float = 0.04
@@ -39,7 +39,7 @@ class CloudSettings:
     probe_points: tuple[int, ...] = (30_000, 300_000)
     """Points whose drawing is timed; a graphics card takes a millisecond or two for the most of them."""
     probe_s: float = 0.05
-    """What takes longer is not timed with more points."""
+    """Slower drawing is not timed with more points."""
     never_slow_points: int = 20_000
     """Memories with fewer points are drawn in full without timing."""
     pause_s: float = 1.0
@@ -48,7 +48,7 @@ class CloudSettings:
 
 @dataclass(frozen=True)
 class Shown:
-    """What of a world is drawn."""
+    """Drawn layers of a world."""
 
     world: ShownWorld = field(compare=False)
     mode: str
@@ -62,13 +62,13 @@ class Shown:
 
     def allowed(self) -> NDArray[np.int64]:
         """Return how many points of each instance may be drawn. Shape (K,)."""
-        things, ids = self.world.instances, self.world.cloud.ids.tolist()
-        solid = np.array([self.points and (self.structure or things[n].structure is None) for n in ids], bool)
+        objects, ids = self.world.instances, self.world.cloud.ids.tolist()
+        solid = np.array([self.points and (self.structure or objects[n].structure is None) for n in ids], bool)
         return np.where(solid, self.world.cloud.counts, 0)
 
 
 class PageClouds:
-    """The points of one page, drawn in its own part of the scene, so that each page gets what it can draw."""
+    """The points of one page, drawn in its own part of the scene, so that each page gets as many as it can draw."""
 
     def __init__(self, client: viser.ClientHandle, settings: CloudSettings, names: PageNames) -> None:
         self._client, self._settings, self.names = client, settings, names
@@ -82,8 +82,8 @@ class PageClouds:
         """As measured on the page; None where it was not, and then all is drawn."""
 
     @property
-    def settled(self) -> bool:
-        """Whether the page shows what it shows at rest."""
+    def at_rest(self) -> bool:
+        """Whether the page shows its picture at rest."""
         with self._lock:
             return FINE in self._nodes and not self._moving
 
@@ -93,7 +93,7 @@ class PageClouds:
         return np.inf if self.seconds_a_point is None else self._settings.rest_s / max(self.seconds_a_point, 1e-12)
 
     def draw(self, shown: Shown) -> None:
-        """Draw a world; the first time, what the page takes to draw is measured."""
+        """Draw a world; the first time, the page's drawing speed is measured."""
         with self._lock:
             before, self._shown = self._shown, shown
             if before is None and shown.world.cloud.counts.sum() > self._settings.never_slow_points:
@@ -144,14 +144,14 @@ class PageClouds:
         if not self.slow or self._shown is None or self.seconds_a_point is None:
             return
         world, budget = self._shown.world, self._settings.moving_s / self.seconds_a_point
-        things = [i for i in world.instances.values() if self._shown.structure or i.structure is None]
-        things = sorted(things, key=lambda i: -i.observations)[: int(budget / 2 / _BOX)] if self._shown.boxes else []
-        if things:
-            ink = [color_of(world, i.id, self._shown.mode) for i in things]
+        objects = [i for i in world.instances.values() if self._shown.structure or i.structure is None]
+        objects = sorted(objects, key=lambda i: -i.observations)[: int(budget / 2 / _BOX)] if self._shown.boxes else []
+        if objects:
+            ink = [color_of(world, i.id, self._shown.mode) for i in objects]
             self._nodes["/coarse/boxes"] = box_lines(
-                self._client.scene, "/coarse/boxes", [i.box for i in things], ink, thick=0
+                self._client.scene, "/coarse/boxes", [i.box for i in objects], ink, thick=0
             )
-        left = int(budget - _BOX * len(things))
+        left = int(budget - _BOX * len(objects))
         self._cloud("/coarse/points", self._part(overview(self._shown.allowed(), left)), "square", _COARSE_M)
 
     def _draw_detail(self) -> None:
@@ -164,8 +164,8 @@ class PageClouds:
         if self._detail_at is not None and np.linalg.norm(place - self._detail_at) <= _MOVED_SHARE * reach:
             return
         self._detail_at, world = place, self._shown.world
-        things = np.array([world.instances[n].structure is None for n in world.cloud.ids.tolist()], bool)
-        hidden = np.where(things, world.cloud.counts - low, 0)
+        objects = np.array([world.instances[n].structure is None for n in world.cloud.ids.tolist()], bool)
+        hidden = np.where(objects, world.cloud.counts - low, 0)
         most = min(self._settings.detail_points, self.most_points - low.sum())
         self._clear("/fine/detail")
         if hidden.any() and most > 0:

@@ -1,4 +1,4 @@
-"""What the panel says of an instance."""
+"""The panel's text of an instance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _MOST_RELATIONS = 14
 
 
 def described(memory: SceneMemory, world: ShownWorld, instance_id: int, relations: list[Relation]) -> str:
-    """Return the panel's text of an instance as Markdown: what, where, how sure, when seen, relations, history."""
+    """Return the panel's text of an instance as Markdown: name, place, confidence, times, relations, history."""
     i, units = world.instances[instance_id], memory.units
     size = " x ".join(f"{v:.2f}" for v in i.box.size)
     place = ", ".join(f"{v:.2f}" for v in i.center)

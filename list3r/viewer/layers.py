@@ -1,4 +1,4 @@
-"""What stands in the 3D scene of all pages: boxes, path, and lines of the selected instance."""
+"""The 3D scene of all pages: boxes, path, and lines of the selected instance."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class LayerSettings:
     """How much is drawn."""
 
     selected_points: int = 100_000
-    """Points of the selected thing that are tinted, at most."""
+    """Points of the selected instance that are tinted, at most."""
     frustums: int = 40
 
 
 class Layers:
-    """The scene of one server; every layer is drawn again when what it shows changes."""
+    """The scene of one server; every layer is drawn again when its content changes."""
 
     def __init__(self, server: viser.ViserServer, settings: LayerSettings) -> None:
         self._scene, self._settings = server.scene, settings
@@ -62,12 +62,12 @@ class Layers:
     def boxes(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
         """Draw the oriented boxes; only that of the selected instance unless all are visible."""
         self.clear("boxes")
-        things = [
+        objects = [
             i for i in world.instances.values() if i.id == selected or (visible and (structure or i.structure is None))
         ]
-        if things:
-            ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in things]
-            node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in things], ink)
+        if objects:
+            ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in objects]
+            node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in objects], ink)
             self._nodes["boxes"] = [node]
 
     def path(self, path: CameraPath, session: int | None, *, visible: bool, unit: float) -> None:
@@ -107,7 +107,7 @@ class Layers:
         ]  # fmt: skip
 
     def relations(self, world: ShownWorld, selected: int, relations: Sequence[Relation]) -> None:
-        """Draw lines from the selected instance to those it is related to, with what relates them."""
+        """Draw lines from the selected instance to related ones, with their predicates."""
         self.clear("relations")
         start = world.instances[selected].center
         words: dict[int, list[str]] = {}
@@ -127,7 +127,7 @@ class Layers:
         self._nodes["relations"] = nodes
 
     def changes(self, world: ShownWorld, *, visible: bool) -> None:
-        """Draw where things were before: arrows of what moved, boxes of what is gone."""
+        """Draw where instances were before: arrows of moved ones, boxes of removed ones."""
         self.clear("changes")
         if not visible:
             return

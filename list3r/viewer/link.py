@@ -17,7 +17,7 @@ _LARGEST = 2**63 - 1
 
 @dataclass(frozen=True)
 class ViewState:
-    """What a link restores, beside the camera."""
+    """The state that a link restores, besides the camera."""
 
     selected: int | None = None
     colors: str = COLOR_MODES[0]
@@ -37,7 +37,7 @@ class ViewState:
 
     @staticmethod
     def decode(code: str) -> ViewState:
-        """Return the view of a code; what a code says that makes no sense is as usual."""
+        """Return the view of a code; invalid parts take their defaults."""
         try:
             padded = code[:_LONGEST] + "=" * (-len(code[:_LONGEST]) % 4)
             given = parse_json(base64.urlsafe_b64decode(padded))

@@ -1,4 +1,4 @@
-"""The names that one page shows: those of the things seen most, as far as they do not cover each other."""
+"""The names that one page shows: of the most seen instances, without overlaps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from list3r.viewer.world import ShownWorld
 
 Size = tuple[float, float]
 _ABOVE = "/fine/labels"
-"""Hidden with what is fine while the camera of a slow page moves."""
+"""Hidden with fine detail while the camera of a slow page moves."""
 _LETTER_PX, _LINE_PX = 6.2, 15.0
 """A letter and a line of a label of scale 1 on the page."""
 
@@ -27,7 +27,7 @@ class NameSettings:
     """How names are shown."""
 
     most: int = 60
-    """Of the things seen most, from which those are chosen that do not cover each other."""
+    """Most seen instances, from which names without overlaps are chosen."""
     scale: float = 0.9
     selected_scale: float = 1.2
 
@@ -42,7 +42,7 @@ class PageNames:
         """Nodes with their places in the world and their sizes in px, the most important first."""
 
     def draw(self, world: ShownWorld, selected: int | None, *, visible: bool) -> None:
-        """Draw the names of a world; that of what is selected always."""
+        """Draw the names of a world; the selected one always."""
         with self._lock:
             for node, _, _ in self._labels:
                 node.remove()
@@ -76,8 +76,8 @@ class PageNames:
         return node, place, (scale * _LETTER_PX * len(text), scale * _LINE_PX)
 
     def _chosen(self, world: ShownWorld, selected: int | None, *, visible: bool) -> Sequence[Instance]:
-        things = [i for i in world.instances.values() if i.structure is None and i.id != selected]
-        seen_most = sorted(things, key=lambda i: -i.observations)[: self._settings.most] if visible else []
+        objects = [i for i in world.instances.values() if i.structure is None and i.id != selected]
+        seen_most = sorted(objects, key=lambda i: -i.observations)[: self._settings.most] if visible else []
         chosen = world.instances.get(selected) if selected is not None else None
         return seen_most if chosen is None else [chosen, *seen_most]
 
@@ -85,7 +85,7 @@ class PageNames:
 def on_page(
     points: NDArray[np.float64], T_world_cam: NDArray[np.float64], fov: float, height_px: float
 ) -> NDArray[np.float64]:
-    """Return where points of the world lie on a page, px from its middle; NaN for those behind the camera.
+    """Return where points of the world are on a page, px from its middle; NaN for those behind the camera.
 
     `fov` is that of the height, in radians. Shape (N, 3) -> (N, 2).
     """
@@ -96,7 +96,7 @@ def on_page(
 
 
 def with_room(at: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which labels are shown: in their order, each that covers none before it. The first always, where it can be.
+    """Return which labels are shown: in order, each that covers no earlier one. The first always, if possible.
 
     `at` is the middle of the lower edge, `size` width and height, both px; y points down. Shapes (N, 2) -> (N,).
     """

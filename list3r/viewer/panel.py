@@ -1,4 +1,4 @@
-"""The panel beside the scene: search, what is selected, layers, sessions and time, measuring, edits, keys."""
+"""The panel next to the scene: search, selection, layers, sessions and time, measuring, edits, keys."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ class Panel:
 
     # ------------------------------------------------------------------ messages
 
-    def tell(self, text: str, picture: NDArray[np.uint8] | None) -> None:
-        """Say what is selected."""
+    def describe(self, text: str, picture: NDArray[np.uint8] | None) -> None:
+        """Describe the selection."""
         self._text.content = text
         self._picture.visible = picture is not None
         if picture is not None:
             self._picture.image = picture
 
     def say(self, text: str) -> None:
-        """Say what was done, or why not."""
+        """Report an action, or why it failed."""
         self._message.content, self._message.visible = text, bool(text)
 
     def found(self, ids: list[int], names: list[str], notes: str) -> None:
@@ -65,7 +65,7 @@ class Panel:
         self.say(notes if ids else f"Nothing found. {notes}")
 
     def follow(self, state: ViewState) -> None:
-        """Set the controls to what is shown."""
+        """Set the controls to the view."""
         self._following = True
         try:
             for name, box in self._boxes.items():
@@ -93,7 +93,7 @@ class Panel:
         def choose(_: object) -> None:
             chosen = self._answers.get(self._choice.value)
             if chosen is not None and chosen != self._viewer.state.selected:
-                self._viewer.select(chosen, look=True)
+                self._viewer.select(chosen, turn=True)
 
         self._choice.on_update(choose)
 
@@ -177,7 +177,7 @@ class Panel:
     def _edit(self, change: Any) -> None:
         selected = self._viewer.state.selected
         if selected is None:
-            self.say("Select a thing first.")
+            self.say("Select an instance first.")
         else:
             self._viewer.edit(lambda: change(selected))
 

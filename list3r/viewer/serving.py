@@ -17,7 +17,7 @@ from websockets.http11 import Request
 
 HOST = "127.0.0.1"
 _PAGES = frozenset(("document", "iframe"))
-"""What a browser calls a request that opens a page, not a picture or a script of another one."""
+"""Sec-Fetch-Dest of a request that opens a page, not a picture or a script of one."""
 
 
 def start_server(port: int, title: str, asked_for: Callable[[str], None]) -> viser.ViserServer:
@@ -32,7 +32,7 @@ def start_server(port: int, title: str, asked_for: Callable[[str], None]) -> vis
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """While a server starts or stops: what viser tells on standard output is left out."""
+    """While a server starts or stops: viser's standard output is suppressed."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
 

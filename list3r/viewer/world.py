@@ -1,4 +1,4 @@
-"""What the viewer shows of a memory: instances with their surface points, the camera's path, what changed."""
+"""The viewer's content of a memory: instances with their surface points, the camera's path, changes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ CHANGE_COLORS = {"added": (40, 160, 80), "moved": (235, 140, 30), "removed": (21
 COLOR_MODES = ("own colour", "instance", "changes")
 _UNCHANGED = (190, 190, 195)
 _SELECTED = (255, 200, 0)
-_BESIDE = 0.008
-"""A ray meets points no further beside it than this share of their depth: about the size at which they are drawn."""
+_RAY_RADIUS = 0.008
+"""Radius of a ray as a share of the points' depth: about the size at which they are drawn."""
 
 
 @dataclass(frozen=True)
 class ShownCloud:
-    """Surface points of many instances, one after the other; those of each in random order, so that any first part of
-    them is a coarser cloud. 15 bytes a point, so that tens of millions fit.
+    """Surface points of many instances, concatenated; each in random order, so that any prefix is a coarser cloud. 15
+    bytes a point, so that tens of millions fit.
     """
 
     points: NDArray[np.float32]
@@ -78,12 +78,12 @@ class ShownWorld:
     changes: dict[int, Changed]
     """The newest change of each instance."""
     unit: float
-    """What a metre is about in world units."""
+    """About a metre in world units."""
 
     def name(self, instance_id: int) -> str:
-        """Return what an instance is called."""
+        """Return the name of an instance."""
         i = self.instances[instance_id]
-        return i.label or i.structure or i.description.split(",")[0] or "thing"
+        return i.label or i.structure or i.description.split(",")[0] or "object"
 
 
 def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
@@ -97,7 +97,7 @@ def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
 
 
 def _unit(instances: list[Instance]) -> float:
-    """What a metre is about where lengths are relative: 1 where things are as far apart as in a home, else a fifth."""
+    """About a metre in a relative memory: 1 where instances are as far apart as in a home, else a fifth."""
     centers = np.array([i.center for i in instances]).reshape(-1, 3)
     extent = float(np.ptp(centers, axis=0).max()) if len(centers) > 1 else 5.0
     return 1.0 if 1.0 < extent < 100.0 else max(extent, 1e-9) / 5.0
@@ -131,8 +131,8 @@ def read_path(memory: SceneMemory) -> CameraPath:
 
 
 def overview(counts: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Return how many points of each instance to show from afar, at most about `most` in all: as many as the square
-    root of what it has allows, so that small things keep theirs. Shape (K,).
+    """Return how many points of each instance to show from afar, at most about `most` in all: in proportion to the
+    square root of their number, so that small instances keep theirs. Shape (K,).
     """
     if counts.sum() <= most:
         return counts
@@ -144,8 +144,8 @@ def overview(counts: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def close_by(world: ShownWorld, hidden: NDArray[np.int64], place: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Return how many hidden points of each instance to show besides: those of the instances nearest to a place, at
-    most `most` in all; `hidden` is how many each has. Shape (K,).
+    """Return how many hidden points of each instance to add: nearest instances to a place first, at most `most` in all;
+    `hidden` is how many each has. Shape (K,).
     """
     boxes = np.array([world.instances[n].aabb for n in world.cloud.ids.tolist()]).reshape(-1, 2, 3)
     gap = np.linalg.norm(np.maximum(0.0, np.maximum(boxes[:, 0] - place, place - boxes[:, 1])), axis=1)
@@ -189,20 +189,20 @@ def pick(
 ) -> tuple[int, NDArray[np.float64]] | None:
     """Return the instance and the point that a ray meets first: a surface point near the ray, else a box.
 
-    Surfaces of things have gaps, so structure is met only where no thing's box lies before it. `direction` is a unit
-    vector; None where the ray meets nothing.
+    Surfaces of instances have gaps, so structure is met only where no instance's box is before it. `direction` is a
+    unit vector; None where the ray meets nothing.
     """
     step = shown.points - origin
     depth = step @ direction
     aside = np.sqrt(np.maximum((step**2).sum(axis=1) - depth**2, 0.0))
-    near = np.flatnonzero((depth > 0) & (aside < _BESIDE * depth))
+    near = np.flatnonzero((depth > 0) & (aside < _RAY_RADIUS * depth))
     first = int(near[np.argmin(depth[near])]) if len(near) else -1
     owner = int(shown.ids[np.searchsorted(np.cumsum(shown.counts), first, side="right")]) if first >= 0 else -1
     if first >= 0 and world.instances[owner].structure is None:
         return owner, shown.points[first].astype(np.float64)
     reach = float(depth[first]) if first >= 0 else np.inf
-    things = [i for i in world.instances.values() if i.structure is None or first < 0]
-    hits = [(t, i.id) for i in things if (t := _box_hit(i, origin, direction)) is not None and t < reach]
+    objects = [i for i in world.instances.values() if i.structure is None or first < 0]
+    hits = [(t, i.id) for i in objects if (t := _box_hit(i, origin, direction)) is not None and t < reach]
     if hits:
         t, n = min(hits)
         return n, origin + t * direction

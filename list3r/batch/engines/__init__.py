@@ -1,1 +1,1 @@
-"""What places tasks: processes of this machine (`local`) or a Ray cluster (`ray`), behind three methods (`base`)."""
+"""Engines that place tasks: processes of this machine (`local`) or a Ray cluster (`ray`), behind `base`."""

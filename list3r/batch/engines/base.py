@@ -1,4 +1,4 @@
-"""The seam between a batch and what runs it."""
+"""The interface between a batch and its engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from list3r.memory.errors import OptionError
 
 @dataclass(frozen=True)
 class TaskResources:
-    """What one task takes."""
+    """Resources of one task."""
 
     cpus: int = 1
     memory_gb: float | None = None
@@ -29,7 +29,7 @@ class TaskResources:
 
 
 class Engine(Protocol):
-    """Places tasks and says how they ended. A task whose process dies is `lost`; to try it again is up to the batch."""
+    """Places tasks and reports how they ended. A task whose process dies is `lost`; the batch decides about a retry."""
 
     window: int
     """Tasks that are submitted at once, at most: more would only wait inside the engine."""

@@ -17,7 +17,7 @@ _AHEAD = 2
 
 
 class RayEngine:
-    """Ray chooses the node of a task by its resources. It never runs a task twice by itself: the batch does that."""
+    """Ray chooses the node of a task by its resources. It never retries a task: the batch does."""
 
     def __init__(self, resources: TaskResources, jobs: int | None = None, address: str | None = None) -> None:
         """Connect to the cluster at an `address`, else to the one of this machine's environment, else start one.

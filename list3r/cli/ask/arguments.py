@@ -29,13 +29,13 @@ from list3r.cli.common import parse_point
 if TYPE_CHECKING:
     from list3r.queries.match import FilterOptions
 
-OF_LOOKS = ("label", "color", "min_size", "max_size", "min_confidence", "structure")
+OF_APPEARANCE = ("label", "color", "min_size", "max_size", "min_confidence", "structure")
 """The filters of questions that do not ask for a state or a component."""
 
 
 @dataclass(frozen=True)
 class FilterArguments:
-    """Which things may answer."""
+    """Which instances may answer."""
 
     label: Label = None
     color: Color = None
@@ -62,21 +62,21 @@ class FilterArguments:
 
 @dataclass(frozen=True)
 class NearArguments:
-    """What to be near to."""
+    """Reference of the distances."""
 
-    words: Annotated[str | None, typer.Argument(metavar="[WORDS]", help="Only things that these words name.")] = None
+    words: Annotated[str | None, typer.Argument(metavar="[WORDS]", help="Only instances that these words name.")] = None
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None
     id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Distance from this instance.")] = None
     max_distance: Annotated[
-        float | None, typer.Option("--max-distance", help="Only things whose surface is at most this far away.")
+        float | None, typer.Option("--max-distance", help="Only instances whose surface is at most this far away.")
     ] = None
 
     def origin(self) -> tuple[float, float, float] | None:
-        """Return the point. Raises `OptionError` where nothing is named, or by what is no point."""
+        """Return the point. Raises `OptionError` where no point, id or words are given, or an invalid point."""
         from list3r.memory.errors import OptionError
 
         if self.words is None and self.point is None and self.id is None:
-            raise OptionError("give what to be near to: --point x,y,z, --id ID, or words such as mug")
+            raise OptionError("give a place: --point x,y,z, --id ID, or words such as mug")
         return None if self.point is None else parse_point(self.point, "--point")
 
 
@@ -125,7 +125,7 @@ class RegionArguments:
 
 @dataclass(frozen=True)
 class RelationArguments:
-    """Which relations, and who looks."""
+    """Wanted relations, and the viewpoint."""
 
     subject: Annotated[
         str | None, typer.Option("--subject", metavar="ID|WORDS", help="First member of the relation: an id or words.")
@@ -143,7 +143,7 @@ class RelationArguments:
         str | None, typer.Option("--object", metavar="ID|WORDS", help="Second member of the relation.")
     ] = None
     other: Annotated[
-        str | None, typer.Option("--and", metavar="ID|WORDS", help="For between: the other of the two things.")
+        str | None, typer.Option("--and", metavar="ID|WORDS", help="For between: the other of the two instances.")
     ] = None
     viewpoint: Annotated[
         str | None,
@@ -152,7 +152,7 @@ class RelationArguments:
             metavar="ID|camera|X,Y,Z",
             help="Viewpoint of left_of, right_of, in_front_of and behind: the centre of an instance, the last place of "
             "the camera (camera), its place in a frame (camera:FRAME), or a point. The view is towards the middle of "
-            "the two things.",
+            "the two instances.",
         ),
     ] = None
     min_confidence: Annotated[
@@ -162,12 +162,10 @@ class RelationArguments:
 
 @dataclass(frozen=True)
 class SimilarArguments:
-    """What things are compared with."""
+    """Query of a comparison."""
 
     id: Annotated[int | None, typer.Option("--id", metavar="ID", help="Compare with this instance.")] = None
-    image: Annotated[
-        Path | None, typer.Option("--image", metavar="FILE", help="Compare with what this picture shows.")
-    ] = None
+    image: Annotated[Path | None, typer.Option("--image", metavar="FILE", help="Compare with this picture.")] = None
     box: Annotated[
         str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only the part of the picture in this box, px.")
     ] = None

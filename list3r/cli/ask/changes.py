@@ -1,4 +1,4 @@
-"""query changes: what sessions have changed."""
+"""query changes: changes between sessions."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ from typing import Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, in_column, open_memory, print_table
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, open_memory, print_table
 from list3r.cli.terminal import note
 
 
 def changes(
     memory: MemoryArgument,
     since: Annotated[
-        int | None, typer.Option("--since", metavar="SESSION", help="Only what changed after this session.")
+        int | None, typer.Option("--since", metavar="SESSION", help="Only changes after this session.")
     ] = None,
-    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also things that were found unchanged.")] = False,
+    seen_again: Annotated[bool, typer.Option("--seen-again", help="Also instances that were found unchanged.")] = False,
     min_confidence: Annotated[
         float, typer.Option("--min-confidence", help="Only changes with at least this confidence.")
     ] = 0.0,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
-    """The things that were moved, removed or added between sessions, with frames that show it.
+    """The instances that were moved, removed or added between sessions, with frames that show it.
 
     Example: list3r query changes house.l3r --since 1
     """
     from list3r.queries.changes import KINDS
     from list3r.queries.changes import changes as find
 
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         found = find(scene.store, since, KINDS if seen_again else KINDS[:3], min_confidence)
         alone = not found and len(scene.sessions()) < 2
         notes = ["the memory holds one session; `list3r update` adds a later one to compare with"] if alone else []

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _WIDTH = 100
 _SCORES = ("s_det", "s_sem", "s_rel", "s_loop")
 _ALSO_DET = "cosine"
-"""What the similarity of two frames is called where instances were not asked."""
+"""Name of the similarity of two frames where instances were not compared."""
 
 
 def loop_report(store: Store) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""info, list, show: what a memory holds."""
+"""info, list, show: the content of a memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, in_column, open_memory, print_table
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, open_memory, print_table
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
@@ -63,12 +63,10 @@ def list_instances(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
+            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
         ),
     ] = None,
-    at: Annotated[
-        int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
-    ] = None,
+    at: AtOption = None,
     json: JsonOption = False,
 ) -> None:
     """List the instances with their place and size.
@@ -88,7 +86,7 @@ def list_instances(
             found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.lengths
     kept = [i for i in found if i.confidence >= least]
-    kinds, starts = ("", "scrap", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
+    kinds, starts = ("", "low-confidence", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
     if json:
         print_answer(map(instance_dict, kept), units, total=len(found))
         return
@@ -111,7 +109,7 @@ def list_instances(
             doubtful = len(scene.instances(structure=False))
         if doubtful:
             kind = "1 doubtful instance is" if doubtful == 1 else f"{doubtful} doubtful instances are"
-            note(f"{kind} not listed: --min-confidence 0 shows what there is")
+            note(f"{kind} not listed: --min-confidence 0 shows all")
 
 
 def _give_or_take(sigma: float | None, units: Lengths | str) -> str:

@@ -1,4 +1,4 @@
-"""What the query commands share: their options, and how answers are shown."""
+"""Options and output of the query commands."""
 
 from __future__ import annotations
 
@@ -28,27 +28,29 @@ MinConfidence = Annotated[
     float | None,
     typer.Option(
         "--min-confidence",
-        help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
+        help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
     ),
 ]
 Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
 Label = Annotated[
     str | None,
-    typer.Option("--label", metavar="WORDS", help="Only things with one of these words in their label or description."),
+    typer.Option("--label", metavar="WORDS", help="Only instances with one of these words in label or description."),
 ]
-Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only things of this colour.")]
-MinSize = Annotated[float | None, typer.Option("--min-size", help="Only things whose longest edge is at least this.")]
-MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only things whose longest edge is at most this.")]
+Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only instances of this colour.")]
+MinSize = Annotated[float | None, typer.Option("--min-size", help="Only instances with at least this longest edge.")]
+MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only instances with at most this longest edge.")]
 State = Annotated[
     str | None,
     typer.Option(
         "--state",
         metavar="present|moved|removed|added|unseen|any",
-        help="Only things in this state; default: all but removed.",
+        help="Only instances in this state; default: all but removed.",
     ),
 ]
 Component = Annotated[int | None, typer.Option("--component", help="Only this connected component.")]
-View = Annotated[int | None, typer.Option("--view", metavar="FRAME", help="What the camera of this frame sees.")]
+View = Annotated[
+    int | None, typer.Option("--view", metavar="FRAME", help="Only instances that the camera of this frame sees.")
+]
 Time = Annotated[
     float | None,
     typer.Option("--time", metavar="S", help="The camera of the posed frame nearest to this time, seconds."),
@@ -132,7 +134,7 @@ def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **
 
 
 def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
-    """Relations with what can be said of the question as a whole."""
+    """Relations with notes on the question as a whole."""
     names = {i.id: in_column(i.label or i.description) for i in scene.instances(structure=None)}
     gravity, units = scene.gravity, scene.lengths
     if json:

@@ -9,7 +9,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask.arguments import (
-    OF_LOOKS,
+    OF_APPEARANCE,
     CameraArguments,
     FilterArguments,
     NearArguments,
@@ -20,19 +20,25 @@ from list3r.cli.ask.arguments import (
 from list3r.cli.ask.changes import changes
 from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
 from list3r.cli.catalog.questions import with_catalog
-from list3r.cli.common import JsonOption, MemoryArgument, only, open_memory, print_table, spread, with_at
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, only, open_memory, print_table, spread
 from list3r.cli.terminal import note, say
 
 
 def nearest(
-    memory: MemoryArgument, near: NearArguments, *, k: Count = 5, filters: FilterArguments, json: JsonOption = False
+    memory: MemoryArgument,
+    near: NearArguments,
+    *,
+    k: Count = 5,
+    filters: FilterArguments,
+    json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
-    """The things nearest to a point or an instance, with distances of surfaces and of centres.
+    """The instances nearest to a point or an instance, with distances of surfaces and of centres.
 
     Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
     """
     origin = near.origin()
-    with open_memory(memory, filters.min_confidence) as scene:
+    with open_memory(memory, filters.min_confidence, at) as scene:
         from list3r.queries.nearest import nearest as ask
 
         matches = ask(
@@ -53,16 +59,17 @@ def within(
     region: RegionArguments,
     camera: Annotated[CameraArguments, only("view", "pose", "session", "max_depth")],
     *,
-    occlusion: Annotated[bool, typer.Option(help="Leave out what other things hide from the camera.")] = True,
-    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
+    occlusion: Annotated[bool, typer.Option(help="Leave out instances that others hide from the camera.")] = True,
+    filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
-    """The things inside a box or a sphere, or those that a camera sees.
+    """The instances inside a box or a sphere, or those that a camera sees.
 
     Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
     """
     lengths: dict[str, Any] = region.lengths(camera)
-    with open_memory(memory, filters.min_confidence) as scene:
+    with open_memory(memory, filters.min_confidence, at) as scene:
         seen_by = camera_from(scene, camera)
         found = scene.within(
             **lengths, camera=seen_by, max_depth=camera.max_depth, occlusion=occlusion, **filters.options()
@@ -70,12 +77,12 @@ def within(
         print_matches(found, scene.lengths, json, total=len(found))
 
 
-def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False) -> None:
-    """The relations between things, by subject, predicate and object.
+def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False, at: AtOption = None) -> None:
+    """The relations between instances, by subject, predicate and object.
 
     Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
     """
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         print_relations(scene, scene.relations(**asdict(asked)), json)
 
 
@@ -84,18 +91,19 @@ def similar(
     like: SimilarArguments,
     *,
     k: Count = 5,
-    filters: Annotated[FilterArguments, only(*OF_LOOKS)],
+    filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
-    """The things that look most like one instance, or like a picture.
+    """The instances most similar in appearance to one instance or to a picture.
 
     Example: list3r query similar house.l3r --image mug.jpg --box 120,80,180,150
     """
     from list3r.memory.errors import OptionError
 
-    with open_memory(memory, filters.min_confidence) as scene:
+    with open_memory(memory, filters.min_confidence, at) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
-            raise OptionError("give what to compare with: --id ID, or --image FILE, with --box for a part of it")
+            raise OptionError("give a query: --id ID, or --image FILE, with --box for a part of it")
         if like.image is not None:
             found = scene.similar_to_picture(like.image, k, box_xyxy=like.corners(), **filters.options())
         else:
@@ -116,12 +124,13 @@ def find(
         typer.Option("--from", metavar="ID|camera|X,Y,Z", help="Viewpoint of left, right, in front of and behind."),
     ] = None,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
-    """The things that a question is about, how many, or yes or no; an id can stand for a thing.
+    """The instances that a question is about, how many, or yes or no; an id can replace words.
 
     Example: list3r query find house.l3r "how many chairs are next to the table?"
     """
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         found, units = scene.find(text, k, viewpoint=viewpoint), scene.lengths
     if not json and (found.counted is not None or found.answer is not None):
         say(str(found.counted) if found.counted is not None else str(found.answer))
@@ -134,6 +143,7 @@ def seen(
     instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
     structure: Structure = False,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """When an instance was seen, or what was visible at a time, in a frame, or from a pose.
 
@@ -141,7 +151,7 @@ def seen(
     """
     from list3r.memory.errors import OptionError
 
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         camera = camera_from(scene, options)
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
@@ -188,22 +198,23 @@ def path(
     end: Annotated[int, typer.Argument(metavar="ID", help="Second instance.", show_default=False)],
     structure: Annotated[bool, typer.Option(help="Allow paths over floor and walls.")] = True,
     json: JsonOption = False,
+    at: AtOption = None,
 ) -> None:
     """The shortest chain of relations from one instance to another.
 
     Example: list3r query path house.l3r 12 4
     """
-    with open_memory(memory) as scene:
+    with open_memory(memory, at=at) as scene:
         found = scene.path_between(start, end, structure=structure)
         print_relations(scene, found, json)
 
 
 questions = typer.Typer(
-    help="Ask what is near, inside, visible, similar, related, described by words, or changed.",
+    help="Find instances that are near, inside, visible, similar, related, described by words, or changed.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 for command in (nearest, within, relations, similar, find):
-    questions.command(command.__name__)(with_at(with_catalog(spread(command))))
+    questions.command(command.__name__)(with_catalog(spread(command)))
 for other in (seen, path, changes):
-    questions.command(other.__name__)(with_at(spread(other)))
+    questions.command(other.__name__)(spread(other))

@@ -27,7 +27,7 @@ _RUN = only("licence", "scale_anchor", "detector", "detector_classes")
 class BatchPlace:
     """Where the tasks of a batch run, as options."""
 
-    engine: Annotated[str, typer.Option("--engine", metavar="local|ray", help="What runs the tasks.")] = "local"
+    engine: Annotated[str, typer.Option("--engine", metavar="local|ray", help="Engine that runs the tasks.")] = "local"
     address: Annotated[
         str | None,
         typer.Option("--address", metavar="ADDRESS", help="Address of the Ray cluster; default: RAY_ADDRESS."),
@@ -57,7 +57,7 @@ class BatchPlace:
 
 @dataclass(frozen=True)
 class BatchTasks:
-    """Which tasks, and what they may do, as options."""
+    """Options of the tasks."""
 
     element: Annotated[
         int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
@@ -130,21 +130,21 @@ def batch(
 
 
 def _read(videos: str, given: src.SourceArguments, request: BuildRequest, run: RunOptions) -> list[list[BatchTask]]:
-    """Return the videos of each memory, before what builds them is loaded."""
+    """Return the videos of each memory, before the builder is loaded."""
     from list3r.batch.tasks import Asked, read_tasks
 
     return read_tasks(videos, Asked(lambda fields: replace(given, **fields).options(), request, run))
 
 
 def _outcome_printer(quiet: bool) -> Any:
-    """Return what prints how each task ended, one line on standard error."""
+    """Return a callback that prints the outcome of each task, one line on standard error."""
 
-    def print_outcome(outcome: Outcome, settled: int, total: int) -> None:
+    def print_outcome(outcome: Outcome, finished: int, total: int) -> None:
         o = outcome
-        result = f"{o.frames} frames, {o.instances} things" if o.built else o.reason
-        note(f"[{settled}/{total}] {o.task.memory}: {o.state}, {result} ({o.seconds:.1f} s)")
+        result = f"{o.frames} frames, {o.instances} instances" if o.built else o.reason
+        note(f"[{finished}/{total}] {o.task.memory}: {o.state}, {result} ({o.seconds:.1f} s)")
 
-    return (lambda outcome, settled, total: None) if quiet else print_outcome
+    return (lambda outcome, finished, total: None) if quiet else print_outcome
 
 
 def _print_report(report: BatchReport, json: bool) -> None:

@@ -1,4 +1,4 @@
-"""What building and updating take from the command line besides the source and the memory."""
+"""Options of build and update besides the source and the memory."""
 
 from __future__ import annotations
 

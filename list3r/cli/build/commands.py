@@ -32,7 +32,7 @@ def inspect(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Report what a source contains: format, frames, size, depth, intrinsics, poses, and what is missing.
+    """Report what a source contains: format, frames, size, depth, intrinsics, poses, and missing parts.
 
     Example: list3r inspect walk.mp4 --json
     """

@@ -19,7 +19,7 @@ EXPORTS = (("json", "json"), ("usd", "usdc"), ("plan", "png"), ("glb", "glb"), (
 
 
 def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, quiet: bool) -> dict[str, Any]:
-    """Make `out/walk`, `out/rooms.l3r` and the exports beside it; what was found, for JSON."""
+    """Make `out/walk`, `out/rooms.l3r` and the exports next to it; returns the results, for JSON."""
     from list3r.pipeline.target import make_folder
 
     for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("workers", workers, 1)):
@@ -41,7 +41,7 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
         _ask(scene, memory, quiet)
         written = _export(scene, out, quiet)
         scores = _score(out, walk, quiet)
-    _print(quiet, f"\nThe picture to look at: {written['plan']}")
+    _print(quiet, f"\nA picture of the result: {written['plan']}")
     return {"memory": str(memory), "walk": str(walk), "build": report.as_dict(), "exports": written, "scores": scores}
 
 
@@ -71,7 +71,7 @@ def _render(walk: Path, *, seed: int, frames: int | None, workers: int | None, q
 
 
 def _remove_unfinished(walk: Path) -> None:
-    """Take away what an interrupted demo left: only files and folders that the simulation writes."""
+    """Delete leftovers of an interrupted demo: only files and folders that the simulation writes."""
     import shutil
 
     for name in ("rgb", "depth", "ids"):
@@ -83,16 +83,16 @@ def _remove_unfinished(walk: Path) -> None:
 def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
     if quiet:
         return
-    things = scene.instances()
+    objects = scene.instances()
     names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
     say("", f"3. list3r list {memory}")
-    print_table([[i.id, names[i.id], i.confidence] for i in things], ["id", "what", "conf"])
+    print_table([[i.id, names[i.id], i.confidence] for i in objects], ["id", "what", "conf"])
     say("", f"4. list3r query relations {memory} --predicate on")
     rows = [[names[r.subject], "on", names[r.object], r.confidence] for r in scene.relations(predicate="on")]
     print_table(rows, ["subject", "", "object", "conf"])
-    if not things:
+    if not objects:
         return
-    first = min(things, key=lambda i: float(i.box.size.prod()))
+    first = min(objects, key=lambda i: float(i.box.size.prod()))
     say("", f"5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {names[first.id]})")
     matches = scene.nearest(first.id, k=3)
     print_table([[m.instance.id, names[m.instance.id], m.distance_m] for m in matches], ["id", "what", "surface (m)"])

@@ -85,7 +85,7 @@ def read_size(text: str) -> tuple[int, int]:
 
 
 def _convert_predictions(source: Path, folder: Path, options: OutputOptions, json: bool) -> None:
-    """Bring what a network's own program saved to the layout that `--reconstruction precomputed` reads."""
+    """Convert the output of a network's own program to the layout that `--reconstruction precomputed` reads."""
     from list3r.reconstruction.outputs.registry import convert_predictions
 
     frames = convert_predictions(source, folder, options)
@@ -114,6 +114,6 @@ def import_map(
     if json:
         print_answer([{"memory": str(memory), **report.as_dict()}])
         return
-    say(f"{memory}  {report.format}: {report.things} things became {report.instances} instances")
+    say(f"{memory}  {report.format}: {report.objects} objects became {report.instances} instances")
     say(f"structure  {report.structure} pieces, {report.relations} relations")
     say(*(f"note: {line}" for line in report.notes))

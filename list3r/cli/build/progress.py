@@ -1,4 +1,4 @@
-"""Progress of a build, and what is said at its end."""
+"""Progress of a build, and its report."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def watching(
 ) -> Iterator[Watch]:
     """Show progress in a bar, and notes above it unless they are not wanted.
 
-    Ctrl-C ends the command with what `interrupted` says, which hears whether a chunk was finished.
+    Ctrl-C ends the command with the message of `interrupted`, called with whether a chunk was finished.
     """
     begun = False
     try:
@@ -45,10 +45,10 @@ def watching(
 
 
 def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
-    """Return what moves a progress bar while a video is looked at before its chunks; then it begins again as `then`."""
+    """Return the callback of a progress bar while a video is scanned before its chunks; then it restarts as `then`."""
     now = then
 
-    def look(what: str, done: int, total: int) -> None:
+    def scan(what: str, done: int, total: int) -> None:
         nonlocal now
         if now != what:
             bar.stage(f"looking for {what}")
@@ -58,13 +58,13 @@ def looking(bar: ProgressBar, then: str) -> Callable[[str, int, int], None]:
             bar.stage(then, "frames")
             now = then
 
-    return look
+    return scan
 
 
 def say_result(
     memory: Path, work: Callable[[], Report], lines: Callable[[Path, Report], list[str]], json: bool
 ) -> None:
-    """Do the work and print its report. What failed after the memory was written is raised after that is printed."""
+    """Do the work and print its report. Errors after the memory was written are raised after the report."""
     from list3r.pipeline.finishing import FinishingError
 
     failure = None
@@ -89,13 +89,13 @@ def say_result(
 
 
 def report_lines(memory: Path, report: BuildReport) -> list[str]:
-    """Return what a build did, for people."""
+    """Return the report of a build as text."""
     size = memory.stat().st_size / 1e6
     lines = [
         f"{memory}  {size:.1f} MB",
         f"frames     {report.posed} of {report.frames} posed, {report.lost} lost, {report.bad} unreadable",
         f"chunks     {report.chunks} in {report.components} part{'s' * (report.components > 1)}, {report.loops} loops",
-        f"instances  {report.instances} things, {report.structure} pieces of structure, {report.relations} relations",
+        f"instances  {report.instances} objects, {report.structure} pieces of structure, {report.relations} relations",
         f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
     ]
     lines += [f"note: {line}" for line in report.notes]

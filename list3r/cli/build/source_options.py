@@ -51,13 +51,13 @@ Topics = Annotated[
     typer.Option(
         "--topics",
         metavar="ROLE=TOPIC,...",
-        help="Topics of a ROS recording (color=/a,depth=/b,pose=/c) or cameras of LeRobot; default: those that fit.",
+        help="Topics of a ROS recording (color=/a,depth=/b,pose=/c) or cameras of LeRobot; default: matching ones.",
     ),
 ]
 Episode = Annotated[
     int | None, typer.Option("--episode", metavar="N", help="Episode of a LeRobot data set.", show_default=False)
 ]
-Registered = Annotated[bool, typer.Option("--registered", help="Depth already lies on the colour image's pixels.")]
+Registered = Annotated[bool, typer.Option("--registered", help="Depth already is on the colour image's pixels.")]
 DepthScale = Annotated[
     float | None, typer.Option("--depth-scale", metavar="UNITS", help="Stored depth units per metre.")
 ]
@@ -116,7 +116,7 @@ class SourceArguments:
     max_side: MaxSide = None
 
     def options(self, more: list[str] | None = None) -> SourceOptions:
-        """Return what they mean, with further files of the recording. Raises `OptionError` naming the option."""
+        """Return the parsed options, with further files of the recording. Raises `OptionError` naming the option."""
         from list3r.frames import options as parsing
 
         first, stop = parsing.parse_range(self.frames) if self.frames else (None, None)

@@ -23,7 +23,7 @@ def update(
     asked: BuildOptions,
     json: JsonOption = False,
 ) -> None:
-    """Add a later video to a memory: place it in the same world, and record what has changed.
+    """Add a later video to a memory: place it in the same world, and record changes.
 
     Example: list3r update house.l3r walk-2/
     """
@@ -41,13 +41,13 @@ def update(
 
 
 def report_lines(memory: Path, report: UpdateReport) -> list[str]:
-    """Return what an update did, for people."""
+    """Return the report of an update as text."""
     events = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in report.events.items())
     lines = [
         f"{memory}  session {report.session}",
         f"frames     {report.posed} of {report.frames} posed, {report.lost} lost, {report.bad} unreadable",
         f"placed     {report.placed} of {report.chunks} chunks, by {report.ties} relations to earlier sessions",
-        f"things     {events}; {report.instances} in all",
+        f"objects    {events}; {report.instances} in all",
         f"time       {report.seconds:.1f} s, {report.frames_per_second:.1f} frames/s",
     ]
     return lines + [f"note: {line}" for line in report.notes]

@@ -116,9 +116,7 @@ def check(catalog: CatalogOption = _DEFAULT, json: JsonOption = False) -> None:
 def rebuild(
     files: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[FILE...]", help="Memory files, or folders of them; default: those that the catalogue knows."
-        ),
+        typer.Argument(metavar="[FILE...]", help="Memory files, or folders of them; default: all in the catalogue."),
     ] = None,
     catalog: CatalogOption = _DEFAULT,
     json: JsonOption = False,
@@ -141,7 +139,7 @@ def rebuild(
     note(f"{len(entries)} memories; forgot {', '.join(gone) or 'none'}")
 
 
-_HEADER = ("memory", "revision", "things", "file")
+_HEADER = ("memory", "revision", "instances", "file")
 
 
 def _opened(url: str, *, make: bool = False) -> Catalog:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import asked_at, in_column, parse_point, print_table
+from list3r.cli.common import in_column, parse_point, print_table
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ALL = "@all"
 """In the place of the memory: all memories of the catalogue."""
-_TOLD = {
+_LISTED = {
     "nearest": ("words", "point", "id", "k", "min_confidence", "state", "structure"),
     "within": ("box", "point", "radius", "min_confidence", "structure"),
     "find": ("text", "k"),
@@ -42,7 +42,7 @@ def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
         typer.Option("--catalog", metavar="URL", help=f"Ask a catalogue; MEMORY is a name in it, or {ALL}."),
     ]
     everywhere = Annotated[
-        bool, typer.Option("--everywhere", help="With --catalog: compare with the things of all memories.")
+        bool, typer.Option("--everywhere", help="With --catalog: compare with the instances of all memories.")
     ]
     kinds: dict[str, Any] = {"catalog": option, **({"everywhere": everywhere} if name == "similar" else {})}
     defaults = {"catalog": None, "everywhere": False}
@@ -72,11 +72,9 @@ def _option_error(text: str) -> Exception:
 
 
 def _check(name: str, arguments: Arguments, signature: inspect.Signature) -> None:
-    """Raise `OptionError` for what is asked that only a file can tell."""
-    if asked_at() is not None:
-        raise _option_error("--at is not available for a catalogue; leave it out, or ask the memory file")
+    """Raise `OptionError` for options that only a file can answer."""
     for word, value in arguments.items():
-        if word not in _TOLD[name] and value != signature.parameters[word].default:
+        if word not in _LISTED[name] and value != signature.parameters[word].default:
             flag = word.replace("_", "-")
             raise _option_error(f"--{flag} is not available for a catalogue; leave it out, or ask the memory file")
 
@@ -90,7 +88,7 @@ def _ask(url: str, name: str, memory: str | None, arguments: Arguments, json: bo
     )
     with Catalog.open(url, make=False) as catalog:
         if name == "relations":
-            found = catalog.relations(memory, **{w: arguments[w] for w in _TOLD[name][:3]}, k=_MOST_RELATIONS)
+            found = catalog.relations(memory, **{w: arguments[w] for w in _LISTED[name][:3]}, k=_MOST_RELATIONS)
             rows = [r for r in found if r.confidence >= filters.min_confidence]
             _print(rows, found, json, _relation_row, _RELATIONS)
             return

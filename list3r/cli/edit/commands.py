@@ -1,4 +1,4 @@
-"""merges, undo, merge, split, label, delete: what an operator puts right."""
+"""merges, undo, merge, split, label, delete: corrections by an operator."""
 
 from __future__ import annotations
 
@@ -78,21 +78,21 @@ def undo(
 
     Example: list3r undo house.l3r 41
     """
-    _carry_out(memory, lambda scene: scene.undo(entry, author=author), json)
+    _run_edit(memory, lambda scene: scene.undo(entry, author=author), json)
 
 
 def merge(
     memory: MemoryArgument,
     a: Annotated[int, typer.Argument(metavar="A", help="An instance.", show_default=False)],
-    b: Annotated[int, typer.Argument(metavar="B", help="The same thing under another id.", show_default=False)],
+    b: Annotated[int, typer.Argument(metavar="B", help="The same instance under another id.", show_default=False)],
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Merge two instances that are one thing: the older id stays, and the other resolves to it from then on.
+    """Merge two instances that are one instance: the older id stays, and the other resolves to it from then on.
 
     Example: list3r merge house.l3r 12 31
     """
-    _carry_out(memory, lambda scene: scene.merge(a, b, author=author), json)
+    _run_edit(memory, lambda scene: scene.merge(a, b, author=author), json)
 
 
 def split(
@@ -110,12 +110,12 @@ def split(
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Split an instance that is two things: the larger part keeps the id.
+    """Split an instance that is two instances: the larger part keeps the id.
 
     Example: list3r split house.l3r 12 --out 3:4,5:2
     """
     parts = None if out is None else _parse_parts(out)
-    _carry_out(memory, lambda scene: scene.split(instance_id, parts, author=author), json)
+    _run_edit(memory, lambda scene: scene.split(instance_id, parts, author=author), json)
 
 
 def label(
@@ -129,7 +129,7 @@ def label(
 
     Example: list3r label house.l3r 12 "my mug"
     """
-    _carry_out(memory, lambda scene: scene.label(instance_id, text, author=author), json)
+    _run_edit(memory, lambda scene: scene.label(instance_id, text, author=author), json)
 
 
 def delete(
@@ -139,10 +139,10 @@ def delete(
 
     Example: list3r delete house.l3r 12
     """
-    _carry_out(memory, lambda scene: scene.delete(instance_id, author=author), json)
+    _run_edit(memory, lambda scene: scene.delete(instance_id, author=author), json)
 
 
-def _carry_out(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool) -> None:
+def _run_edit(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool) -> None:
     from list3r.api import open as open_scene
 
     with open_scene(path, writable=True) as scene:

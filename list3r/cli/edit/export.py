@@ -31,12 +31,12 @@ _FORMAT_OPTION = typer.Option(
 
 @dataclass(frozen=True)
 class ExportArguments:
-    """Options of some formats. What is left out takes the default of the format."""
+    """Options of some formats. Omitted ones take the default of the format."""
 
     color: str | None = field(default=None, metadata=option("ply, glb: rgb (as seen) or instance.", "rgb|instance"))
     tokens: int | None = field(default=None, metadata=option("prompt: most tokens of the text; default: 2000.", "N"))
     question: str | None = field(
-        default=None, metadata=option("prompt: a question; what it asks about comes first.", "TEXT")
+        default=None, metadata=option("prompt: a question; instances it asks about come first.", "TEXT")
     )
     mesh: bool = field(
         default=False, metadata=option("usd: write a closed mesh of each instance instead of its points.")
@@ -45,7 +45,7 @@ class ExportArguments:
     density: float | None = field(
         default=None, metadata=option("simready: kg per cubic metre of the hull, for an estimated mass.", "KG/M3")
     )
-    ids: str | None = field(default=None, metadata=option("simready: only these things, such as 3,7,12.", "ID,..."))
+    ids: str | None = field(default=None, metadata=option("simready: only these instances, such as 3,7,12.", "ID,..."))
 
     guessed_metre: bool = field(
         default=False, metadata=option("simready: take a guessed metre for one; lengths and masses are as wrong as it.")
@@ -81,7 +81,7 @@ def export(
         float | None,
         typer.Option(
             "--min-confidence",
-            help="Everything with at least this confidence, including scraps, which are otherwise not listed.",
+            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
         ),
     ] = None,
     json: JsonOption = False,
@@ -113,8 +113,8 @@ def export(
 
 @contextlib.contextmanager
 def _watched(to: str, *, quiet: bool) -> Iterator[dict[str, Any]]:
-    """Show how far an export is: the option by which some formats tell it."""
-    with progress_bar(f"writing {to}", "things", quiet=quiet) as bar:
+    """Show the progress of an export: the option of the formats that report it."""
+    with progress_bar(f"writing {to}", "instances", quiet=quiet) as bar:
         yield {"progress": bar.show} if "progress" in find_format(to).options else {}
 
 
@@ -134,4 +134,4 @@ def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
         with first.open("rb") as file:
             shutil.copyfileobj(file, sys.stdout.buffer)
     for other in others:
-        note(f"note: {other.name} is left out; --out FILE writes it beside the file")
+        note(f"note: {other.name} is left out; --out FILE writes it next to the file")

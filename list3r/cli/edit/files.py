@@ -19,10 +19,10 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
     """
     from list3r.memory.errors import MemoryFileError
 
-    found, state, chunks, beside = [], [], None, None
+    found, state, chunks, leftovers = [], [], None, None
     try:
         with open_memory(memory) as scene:
-            beside = scene.store.beside()
+            leftovers = scene.store.beside()
             found = scene.store.verify()
             if not found:
                 chunks = len(scene.store.chunks.all())
@@ -32,18 +32,18 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
             raise
         found = [f"it cannot be opened: {error.__cause__}"]
     if json:
-        facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": beside}
+        facts = {"memory": str(memory), "sound": not found, "damage": found, "beside": leftovers}
         print_answer([{**facts, "sessions": state, "chunks": chunks}])
     elif found:
         say(*found)
-        say(f"`list3r repair {memory}` saves what is sound")
+        say(f"`list3r repair {memory}` saves the sound rows")
     else:
         unfinished = (
             "; the build is unfinished, continue with --resume" if any(s["state"] == "building" for s in state) else ""
         )
         say(f"{memory} is sound: {chunks} chunks{unfinished}")
-    if beside and not json:
-        say(beside)
+    if leftovers and not json:
+        say(leftovers)
     if found:
         raise typer.Exit(1)
 
@@ -69,7 +69,7 @@ def repair(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Repair a damaged memory: keep every sound row, derive the rest again, list what is lost. The original is kept.
+    """Repair a damaged memory: keep every sound row, derive the rest again, list losses. The original is kept.
 
     Example: list3r repair house.l3r
     """
@@ -94,7 +94,7 @@ def repair(
 
 
 def doctor(json: JsonOption = False) -> None:
-    """Check what is installed, what is missing, and what does not work without it.
+    """Check which packages are installed or missing, and the functions that need them.
 
     Example: list3r doctor
     """

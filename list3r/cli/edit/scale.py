@@ -1,4 +1,4 @@
-"""scale: how long a unit of a memory is, and what an operator knows of it."""
+"""scale: the length of a memory's unit, and lengths known to an operator."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scale(
     author: AuthorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Give one known length, so that all lengths become metres. Without --anchor, show what is known about the scale.
+    """Give one known length, so that all lengths become metres. Without --anchor, show the scale and its source.
 
     Example: list3r scale house.l3r --anchor "12=0.095m"
     """

@@ -67,7 +67,7 @@ class CloudArguments:
 
 def cloud(truth: Truth, estimate: Estimate, asked: CloudArguments, json: JsonOption = False) -> None:
     """Accuracy, completeness, Chamfer, normal consistency, F-score. TRUTH: a cloud or mesh, a memory, or a source with
-    depth and poses; ESTIMATE: a cloud or a memory (all supports of its things and surfaces, in the world).
+    depth and poses; ESTIMATE: a cloud or a memory (all supports of its instances and surfaces, in the world).
 
     Example: list3r eval cloud truth.ply house.l3r --align walk/groundtruth.txt --plot cloud.png
     """
@@ -161,7 +161,7 @@ def _cloud_alignment(
         S = alignment_of(goal, read_trajectory(estimate_path), with_scale=free)
         steps.append(f"{kind} by the camera's path")
     if not steps:
-        return S, "not: both lie in one frame of reference"
+        return S, "not: both are in one frame of reference"
     return S, f"{', then '.join(steps)}; scale {float(S.scale):.4f}"
 
 

@@ -113,14 +113,14 @@ def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float
 
 @dataclass(frozen=True)
 class InstanceArguments:
-    """How a scene is placed, and where true ids lie."""
+    """How a scene is placed, and where true ids are."""
 
     align: Annotated[
         str | None,
         typer.Option(
             "--align",
             metavar="TRAJECTORY|none",
-            help="True camera path, by which a memory is aligned. Default: groundtruth.txt beside TRUTH, if present.",
+            help="True camera path, by which a memory is aligned. Default: groundtruth.txt next to TRUTH, if present.",
         ),
     ] = None
     scale: ScaleOption = "auto"
@@ -129,7 +129,7 @@ class InstanceArguments:
         typer.Option(
             "--ids",
             metavar="FOLDER",
-            help="Folder with images of true ids, to count the id switches of a memory. Default: ids/ beside TRUTH.",
+            help="Folder with images of true ids, to count the id switches of a memory. Default: ids/ next to TRUTH.",
         ),
     ] = None
     every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1
@@ -152,9 +152,9 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: 
     check_plot(asked.plot)
     check_every(asked.every)
     true, found = read_scene(truth), read_scene_of(estimate)
-    beside = truth.parent / "groundtruth.txt"
-    if align is None and is_database(estimate) and beside.is_file():
-        align = str(beside)
+    groundtruth = truth.parent / "groundtruth.txt"
+    if align is None and is_database(estimate) and groundtruth.is_file():
+        align = str(groundtruth)
     free = free_scale(asked.scale, estimate)
     S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, free=free)
     scores = evaluate_scene(found, true, S_truth_scene)
@@ -173,7 +173,7 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: 
         say(f"missed: {missed['label']} ({missed['id']})")
     identities = scores["identities"]
     if identities is not None:
-        say(f"{identities['switches']} id switches of {identities['objects']} things in {identities['frames']} frames")
+        say(f"{identities['switches']} id switches of {identities['objects']} objects in {identities['frames']} frames")
         labels = {int(e["id"]): e.get("label") for e in true["instances"]}
         for k, several in identities["several_ids"].items():
             say(f"several ids: {labels.get(k)} ({k}) was {', '.join(map(str, several))}")
@@ -222,9 +222,9 @@ def score_rows(scores: dict[str, Any]) -> list[list[object]]:
     for threshold in ("0.25", "0.50"):
         entry = scores[f"instances_{threshold}"]
         more = f"{entry['duplicates']} duplicates, {entry['merged_pairs']} merged pairs"
-        rows.append([f"things at IoU {threshold}", share(entry["recall"]), share(entry["precision"]), more])
+        rows.append([f"objects at IoU {threshold}", share(entry["recall"]), share(entry["precision"]), more])
     for name, entry in scores["relations"]["by_predicate"].items():
-        rows.append([f"{name}, of matched things", share(entry["recall"]), share(entry["precision"]), ""])
+        rows.append([f"{name}, of matched objects", share(entry["recall"]), share(entry["precision"]), ""])
     return rows
 
 

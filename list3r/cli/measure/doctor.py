@@ -1,4 +1,4 @@
-"""What `list3r doctor` looks at."""
+"""Checks of `list3r doctor`."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _LIBRARIES = (
 
 
 def findings() -> list[tuple[str, str, str]]:
-    """(part, state, what it is needed for); a state that begins with MISSING needs mending."""
+    """(part, state, purpose); a state that begins with MISSING is an error."""
     rows = [
         ("system", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}", "everything"),
         ("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()), "speed"),

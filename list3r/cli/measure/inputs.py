@@ -1,4 +1,4 @@
-"""What the eval commands compare: trajectories, frames, clouds, scenes and masks behind a path."""
+"""Inputs of the eval commands: trajectories, frames, clouds, scenes and masks behind a path."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def _fused(path: Path, every: int | None) -> tuple[PointCloud, Trajectory]:
 
 
 def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
-    """All supports of things and surfaces in a memory's main part."""
+    """All supports of instances and surfaces in a memory's main part."""
     import numpy as np
 
     from list3r.evaluation.point_clouds import PointCloud
@@ -213,7 +213,7 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
     if not len(points):
         raise OptionError(f"{path} holds no surface point; finish its build with --resume")
     surfaces = sum(i.structure is not None for i in main.instances)
-    text = f"{len(points):,} points of {len(supports) - surfaces} things and {surfaces} surfaces"
+    text = f"{len(points):,} points of {len(supports) - surfaces} instances and {surfaces} surfaces"
     return PointCloud(points, None, text), _stored(path)
 
 

@@ -1,4 +1,4 @@
-"""What the eval commands share: their options, and how pictures are checked and written."""
+"""Shared options of the eval commands, and output of pictures."""
 
 from __future__ import annotations
 

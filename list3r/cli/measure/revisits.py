@@ -59,7 +59,7 @@ def revisits(
     json: JsonOption = False,
 ) -> None:
     """Precision and recall of loops against covisibility. TRUTH: the source with depth and poses, or an .npz of frame
-    (F,), time_s (F,) and share (F, F): the part of what frame i sees that frame j sees too.
+    (F,), time_s (F,) and share (F, F): the part of frame i's surface that frame j sees too.
 
     Example: list3r eval revisits walk house.l3r --every 5 --save covisibility.npz
     """

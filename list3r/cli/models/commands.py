@@ -28,11 +28,11 @@ models = typer.Typer(
 @models.command("list")
 def list_models(
     licence: Annotated[
-        str, typer.Option("--licence", metavar="permissive|research|any", help="Show what this profile allows.")
+        str, typer.Option("--licence", metavar="permissive|research|any", help="Show models that this profile allows.")
     ] = "any",
     json: JsonOption = False,
 ) -> None:
-    """List every model: what it does, its licences, and whether its package and weights are on this machine.
+    """List every model: purpose, licences, and whether its package and weights are on this machine.
 
     Example: list3r models list --licence permissive
     """
@@ -121,7 +121,7 @@ def precompute(
 
 
 def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
-    """What is known of a model with some weights, and what of it is on this machine."""
+    """Facts of a model with some weights, and its parts on this machine."""
     from list3r.models.cache import find_cached
     from list3r.models.presets import missing_package
 
@@ -147,7 +147,7 @@ def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
 
 
 def _wanted(name: str, licence: str) -> list[Weights]:
-    """The weights that a name means. Raises `OptionError` for what is unknown or not allowed."""
+    """The weights of a name. Raises `OptionError` for an unknown or forbidden name."""
     from list3r.memory.errors import OptionError
     from list3r.models.cards import cards_named
     from list3r.models.licences import check_profile, choose_weights
@@ -162,7 +162,7 @@ def _wanted(name: str, licence: str) -> list[Weights]:
 
 
 def _named(name: str, licence: str) -> Weights:
-    """Weights that are named by their repository. Raises `OptionError` for what the profile does not allow."""
+    """Weights that are named by their repository. Raises `OptionError` for weights that the profile does not allow."""
     from list3r.memory.errors import OptionError
     from list3r.models.cache import split_name
     from list3r.models.cards import CARDS, OTHER, UNPINNED, Weights, find_weights

@@ -1,4 +1,4 @@
-"""detect: names of things from a box detector."""
+"""detect: names of instances from a box detector."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def detect(
     detector: Annotated[
         Path,
         typer.Option(
-            "--detector", metavar="FILE", help="A NanoDet detector for ncnn (.param, with its .bin beside it)."
+            "--detector", metavar="FILE", help="A NanoDet detector for ncnn (.param, with its .bin next to it)."
         ),
     ],
     *,
@@ -31,14 +31,14 @@ def detect(
         typer.Option(
             "--source",
             metavar="SOURCE",
-            help="The video that the memory was built from, to look at more frames than the kept pictures.",
+            help="The video that the memory was built from, for more frames than the kept pictures.",
             show_default=False,
         ),
     ] = None,
     given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
-    """Name the things of a memory with a box detector, whose boxes vote over many frames. Names by an operator stay.
+    """Name the instances of a memory with a box detector, whose boxes vote over many frames. Names by an operator stay.
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
@@ -54,5 +54,5 @@ def detect(
     if json:
         print_answer([{"memory": str(memory), **report.as_dict()}])
         return
-    say(f"{report.detector} looked at {report.frames} pictures and found {report.boxes} boxes")
+    say(f"{report.detector} searched {report.frames} pictures and found {report.boxes} boxes")
     print_table(sorted(report.labels.items()), ["id", "label"])

@@ -1,4 +1,4 @@
-"""embed: vectors of a text and image model, so that free words find things."""
+"""embed: vectors of a text and image model, so that free words find instances."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def embed(
     run: Annotated[RunOptions, only("licence")],
     json: JsonOption = False,
 ) -> None:
-    """Embed every thing with a text-image model, so that any words can find it.
+    """Embed every instance with a text-image model, so that any words can find it.
 
     Example: list3r embed house.l3r --model siglip2
     """
@@ -37,6 +37,6 @@ def embed(
     if json:
         print_answer([vars(report)])
         return
-    say(f"{report.instances} things have a vector in {report.space}")
+    say(f"{report.instances} instances have a vector in {report.space}")
     if report.without_picture:
         say(f"{report.without_picture} are in no stored picture")

@@ -27,7 +27,7 @@ def view(
     from list3r.memory.errors import OptionError
 
     if not 0 < port <= 65535:
-        raise OptionError(f"--port {port} must lie between 1 and 65535")
+        raise OptionError(f"--port {port} must be between 1 and 65535")
     from list3r.viewer.app import Viewer, ViewerSettings, serve
 
     with contextlib.ExitStack() as stack:
@@ -37,9 +37,9 @@ def view(
         if len(viewers) > 1:
             from list3r.viewer.side_by_side import SideBySide
 
-            beside = SideBySide([(v.memory.path.name, v.address) for v in viewers])
-            stack.callback(beside.stop)
-            address = beside.address
+            both = SideBySide([(v.memory.path.name, v.address) for v in viewers])
+            stack.callback(both.stop)
+            address = both.address
         note(f"{address}  (Ctrl-C stops it)")
         if browser:
             import webbrowser

@@ -20,8 +20,8 @@ _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 def write_nerfstudio(store: Store, folder: str | Path) -> tuple[Path, ...]:
     """Write `transforms.json`, `points.ply` and `images/` to a folder; return the files.
 
-    Poses are camera-to-world with OpenGL's axes, z is up, lengths are those of the memory. What was not placed
-    against the main component has files of its own.
+    Poses are camera-to-world with OpenGL's axes, z is up, lengths are those of the memory. Other components have files
+    of their own.
     """
     folder = Path(folder)
     with replacing_folder(folder, "nerfstudio") as temporary:

@@ -1,4 +1,4 @@
-"""Collect what programs that reconstruct from posed pictures need: pictures, their cameras, and coloured points."""
+"""Posed pictures, their cameras and coloured points, the input of reconstruction programs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PosedPicture:
 def write_pictures(store: Store, component: Component, folder: Path) -> list[PosedPicture]:
     """Write the stored pictures of posed keyframes to a folder; return them with their cameras.
 
-    Where none is stored, all posed frames are returned and the pictures are for others to supply under those names.
+    Where none is stored, all posed frames are returned and the user supplies pictures under their names.
     """
     poses = {(f.session_id, f.frame_index): S for f, S in component.poses}
     found = {}
@@ -69,7 +69,7 @@ def _posed(
 
 
 def jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Return (height, width) as the head of a JPEG states it, None for what is no JPEG."""
+    """Return (height, width) from the header of a JPEG, None for another file."""
     at = 2
     while content[:2] == b"\xff\xd8" and at + 9 < len(content):
         if content[at] != 0xFF:

@@ -16,7 +16,7 @@ Faces = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ClosedSurface:
-    """Triangles of which each edge has two, without a border."""
+    """Triangles without a border: two at each edge."""
 
     vertices: Array
     """Shape (V, 3)."""
@@ -44,12 +44,12 @@ class ClosedSurface:
 _TETRAHEDRA = tuple((0, 1 << a, (1 << a) | (1 << b), 7) for a, b in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)))
 """Corners (a bit an axis) of the six tetrahedra of a cube, along its diagonal: alike on faces that two cubes share."""
 _RIGHT_HANDED = (0, 3, 4)
-"""Those of them whose axes come in cyclic order."""
+"""Even permutations of the axes."""
 _CORNERS = np.array([[n >> k & 1 for k in range(3)] for n in range(8)])
 
 
 def zero_level(field: Array) -> ClosedSurface:
-    """Return the surface around what is above 0, in grid steps, by marching tetrahedra.
+    """Return the surface around values above 0, in grid steps, by marching tetrahedra.
 
     The border of the grid must be below 0. Shape (X, Y, Z).
     """
@@ -63,7 +63,7 @@ def zero_level(field: Array) -> ClosedSurface:
     flat, above = field.ravel(), inside.ravel()
     triangles = [_of_tetrahedra(corners[:, list(t)], above) for t in _TETRAHEDRA]
     triangles = [f if n in _RIGHT_HANDED else f[:, ::-1] for n, f in enumerate(triangles)]
-    ends = np.concatenate([*triangles, np.zeros((0, 3, 2), np.int64)])  # each corner of a face lies on an edge
+    ends = np.concatenate([*triangles, np.zeros((0, 3, 2), np.int64)])  # each corner of a face is on an edge
     edges, faces = _distinct(ends.reshape(-1, 2), field.size)
     places = [np.stack(np.unravel_index(edges[:, k], field.shape), axis=1).astype(np.float64) for k in (0, 1)]
     share = np.clip(flat[edges[:, 0]] / (flat[edges[:, 0]] - flat[edges[:, 1]]), 0.05, 0.95)[:, None]
@@ -72,7 +72,7 @@ def zero_level(field: Array) -> ClosedSurface:
 
 def _of_tetrahedra(corners: NDArray[np.int64], above: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the faces inside tetrahedra: three edges (inside, outside) each. Shape (T, 4) -> (N, 3, 2)."""
-    order = np.argsort(~above[corners], axis=1, kind="stable")  # what is inside first
+    order = np.argsort(~above[corners], axis=1, kind="stable")  # inside first
     odd = _odd(order)
     sorted_corners = np.take_along_axis(corners, order, axis=1)
     count = above[corners].sum(axis=1)
@@ -94,7 +94,7 @@ _FACES = {
 
 
 def _odd(order: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which permutations are odd. Shape (T, 4) -> (T,)."""
+    """Return which permutations are odd. Shape (T, 4) -> (T,)."""
     swaps = sum((order[:, a] > order[:, b]).astype(int) for a, b in itertools.combinations(range(4), 2))
     return np.asarray(swaps % 2 == 1)
 
@@ -172,5 +172,5 @@ def _without_corner_contacts(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def filled(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return what is occupied with what it encloses. Any shape."""
+    """Return occupied cells and the cells that they enclose. Any shape."""
     return np.asarray(ndimage.binary_fill_holes(occupied))

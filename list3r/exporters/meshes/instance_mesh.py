@@ -22,17 +22,17 @@ class MeshSettings:
     """How meshes are made. Lengths are shares of an instance's longest side."""
 
     points: int = 20_000
-    """Of an instance that are looked at, at most."""
+    """Used points of an instance, at most."""
     least_points: int = 24
     """With fewer there is no mesh."""
     cells: int = 28
     """Along the longest side, at most."""
     reach_cells: float = 1.6
-    """A point stands for what is so near to it, cells; neighbours on a surface then touch."""
+    """Radius of a point, cells; neighbours on a surface then touch."""
     convex_depth: float = 0.06
-    """A point so deep under the convex hull still lies on it: noise, and the roundness of sides."""
+    """A point so deep under the convex hull is still on it: noise, and the roundness of sides."""
     convex_share: float = 0.85
-    """With this many points on the hull, the hull is the better mesh: what nobody saw is closed straight."""
+    """With this many points on the hull, the hull is the better mesh: it closes unseen sides with planes."""
     convex_sides: float = 0.6
     """And where so much of its area has points, of two opposite sides the better: under a table nothing does."""
     hull_faces: int = 10_000
@@ -54,7 +54,7 @@ class InstanceMesh:
     rgb: NDArray[np.uint8]
     """Of vertices, sRGB. Shape (V, 3)."""
     kind: str
-    """reconstructed: follows the points; hull: convex, also where nobody looked; slab: a plane of structure."""
+    """reconstructed: follows the points; hull: convex, also on unseen sides; slab: a plane of structure."""
 
 
 def instance_mesh(store: Store, instance: Instance, settings: MeshSettings | None = None) -> InstanceMesh | None:
@@ -84,7 +84,7 @@ def mesh_of(instance: Instance, support: Support, settings: MeshSettings | None 
 
 
 def _dense(points: Array) -> NDArray[np.bool_]:
-    """Tell which points have neighbours as near as most have: strays would bend a hull."""
+    """Return which points have neighbours as near as usual: outliers would distort a hull."""
     if len(points) < 10:
         return np.ones(len(points), bool)
     away = np.asarray(cKDTree(points).query(points, k=[9])[0])[:, 0]
@@ -92,7 +92,7 @@ def _dense(points: Array) -> NDArray[np.bool_]:
 
 
 def _hull(points: Array, axes_world: Array, s: MeshSettings) -> ClosedSurface | None:
-    """Return the convex hull where nearly all points lie on it and its sides have points."""
+    """Return the convex hull where nearly all points are on it and its sides have points."""
     size = float(np.ptp(points, axis=0).max())
     _, spread, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if spread[2] < 0.01 * spread[0]:

@@ -110,7 +110,7 @@ def plan_figure(store: Store, component: Component, settings: PlanSettings | Non
 
 
 class _Page:
-    """A figure whose lengths are px from its upper left corner, with the axes of the map in it."""
+    """A figure with lengths in px from its upper left corner and the axes of the map."""
 
     def __init__(self, view: PlanView, settings: PlanSettings, rows: int) -> None:
         width, span = settings.width_px, view.high - view.low
@@ -219,7 +219,7 @@ def _draw_tracks(ax: Axes, view: PlanView, store: Store, component: Component) -
 
 
 def _draw_loops(ax: Axes, view: PlanView, ends: NDArray[np.float64]) -> None:
-    """Draw lines between cameras of the frames that closed a loop, (L, 2, 3), and what they are over the map."""
+    """Draw lines between cameras of the frames that closed a loop, (L, 2, 3), and their legend over the map."""
     if not len(ends):
         return
     xy = view.on_page(ends)
@@ -230,7 +230,7 @@ def _draw_loops(ax: Axes, view: PlanView, ends: NDArray[np.float64]) -> None:
 
 
 def _draw_camera_path(ax: Axes, view: PlanView, component: Component) -> None:
-    """Draw where the camera went, from green to red, with short strokes where it looked; gaps where it was lost."""
+    """Draw the camera's path from green to red, with short strokes in its viewing direction; gaps where it was lost."""
     fade = mpl.colors.LinearSegmentedColormap.from_list("path", [_START, _END])
     reach = 0.012 * float((view.high - view.low).max())
     for session in sorted({frame.session_id for frame, _ in component.poses}):
@@ -242,8 +242,8 @@ def _draw_camera_path(ax: Axes, view: PlanView, component: Component) -> None:
         lines = [xy[k : k + 2] for k in joined]
         ax.add_collection(LineCollection(lines, colors=fade(joined / len(xy)), linewidths=1.6, zorder=5))
         shown_at = np.arange(0, len(xy), max(1, len(xy) // 30))
-        looks = view.on_page(np.stack([poses[k][1].rotation[:, 2] for k in shown_at])) * reach
-        strokes = [(xy[k], xy[k] + look) for k, look in zip(shown_at, looks, strict=True)]
+        ahead = view.on_page(np.stack([poses[k][1].rotation[:, 2] for k in shown_at])) * reach
+        strokes = [(xy[k], xy[k] + step) for k, step in zip(shown_at, ahead, strict=True)]
         ax.add_collection(LineCollection(strokes, colors=fade(shown_at / len(xy)), linewidths=1.1, zorder=5))
         close = bool(np.linalg.norm(xy[-1] - xy[0]) < 4 * reach)
         for at, word, color, mark, side in (
@@ -303,7 +303,7 @@ def _chip(text: mpl.text.Text, instance_id: int) -> None:
 
 
 def _draw_legend(page: _Page, instances: list[Instance], unit: str) -> None:
-    """Write ids, names or descriptions and sizes below the map; where they are too many, those that were seen most."""
+    """Write ids, names or descriptions and sizes below the map; where they are too many, the most seen ones."""
     chosen = _seen_most(instances, page.columns * page.rows)
     width = (page.size[0] - 2 * _EDGE_PX) / page.columns
     top = page.below_map + _FOOT_PX
@@ -337,7 +337,7 @@ def _name(instance: Instance) -> str:
 
 
 def _seen_most(instances: list[Instance], limit: int) -> list[Instance]:
-    """Return at most this many instances, those with the most observations, by id."""
+    """Return at most this many instances, with the most observations, by id."""
     return sorted(sorted(instances, key=lambda i: (-i.observations, i.id))[:limit], key=lambda i: i.id)
 
 

@@ -62,7 +62,7 @@ def _wall_picture(view: PlanView, walls: list[Support]) -> Image:
 
 
 class _Canvas:
-    """Pixels of the map as one number each, with a rim that takes what falls off."""
+    """Pixels of the map as one number each, with a rim for points outside."""
 
     def __init__(self, view: PlanView) -> None:
         span = view.high - view.low
@@ -81,7 +81,7 @@ class _Canvas:
         return np.asarray(y * self._shape[1] + x)
 
     def disc(self, radius: float) -> list[int]:
-        """Return the steps from a pixel to those of a disc round it."""
+        """Return the offsets of a disc of pixels."""
         r = int(np.clip(radius, 0, _MAX_REACH_PX))
         dy, dx = np.mgrid[-r : r + 1, -r : r + 1]
         inside = dx**2 + dy**2 <= (r + 0.5) ** 2

@@ -25,7 +25,7 @@ class PlanView:
     high: Array
     """Upper right corner. Shape (2,)."""
     note: str
-    """What is up in the picture."""
+    """The up direction of the picture."""
 
     def on_page(self, points_world: ArrayLike) -> Array:
         """Return plan coordinates of world points. Shape (..., 3) -> (..., 2)."""
@@ -53,7 +53,7 @@ def choose_view(component: Component, supports: dict[int, Support], gravity: str
 
 
 def choose_rotation(component: Component, gravity: str) -> tuple[Array, str]:
-    """Return R_plan_world that looks down and has the walls along the page, and what it took for up, in words."""
+    """Return R_plan_world that looks down and has the walls along the page, and the chosen up direction in words."""
     up, note = _up(component, gravity)
     right = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
     right /= np.linalg.norm(right)
@@ -93,7 +93,7 @@ def _dominant_angle(component: Component, rotation: Array) -> float:
 
 
 def is_wall(instance: Instance, up: Array) -> bool:
-    """Tell whether an instance is upright structure, by its kind or else by the thin side of its box."""
+    """Return whether an instance is upright structure, by its kind or else by the thin side of its box."""
     if not instance.structure or instance.structure in FLAT_KINDS or not has_box(instance):
         return False
     thin = instance.box.rotation[:, int(np.argmin(instance.box.size))]

@@ -30,7 +30,7 @@ class Budget:
         return True
 
     def add_list(self, head: str, items: Iterable[str], *, share: float = 1.0) -> int:
-        """Add one line of a head and as many of the items as a share of what is left has room for; how many."""
+        """Add a header line and as many items as fit into a share of the remaining tokens; returns their number."""
         separator, room = "; ", self.used + share * self.left
         items, kept, cost = list(items), 0, count_tokens(head + "\n")
         step = count_tokens(separator)

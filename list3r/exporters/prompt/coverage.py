@@ -7,16 +7,14 @@ from collections.abc import Mapping, Set
 import numpy as np
 
 _EXACT = 400
-"""With more pictures than this, after those that show less than another are left out, the greedy choice stands."""
+"""With more pictures than this, dominated ones left out, the greedy choice is kept."""
 _NODES = 2000
 """Nodes of the branch and bound at most, so that the same pictures are chosen everywhere."""
 
 
 def cover(shows: Mapping[int, Set[int]]) -> list[int]:
-    """Return keys of `shows` whose sets together hold all that any of them holds: as few as can be found.
-
-    Pictures that show no more than another one are left out; of the rest an integer program takes the fewest, and
-    where there are too many for it, those that show most that is new, less what turns out not to be needed.
+    """Return keys of a minimum set cover of `shows`. // Pictures dominated by another one are left out; an integer
+    program takes the fewest of the rest, or for too many a greedy choice without its redundant ones.
     """
     kept = _undominated(shows)
     if not kept:
@@ -47,7 +45,7 @@ def _greedy(shows: Mapping[int, Set[int]]) -> list[int]:
 
 
 def _without_spare(chosen: list[int], shows: Mapping[int, Set[int]]) -> list[int]:
-    """Return the choice without those whose instances the others all show, the last chosen looked at first."""
+    """Return the choice without redundant pictures, the last chosen tested first."""
     out = list(chosen)
     for key in reversed(chosen):
         others = set[int]().union(*(shows[k] for k in out if k != key))

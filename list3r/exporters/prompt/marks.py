@@ -1,4 +1,4 @@
-"""Set-of-marks: the outline and the id of every instance on a stored picture, so that words can point at things."""
+"""Set-of-marks: the outline and the id of every instance on a stored picture, so that words can point at instances."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def draw_marks(
     )
     draw = ImageDraw.Draw(image)
     font = ImageFont.load_default(s.font_px)
-    anchors = [_anchor(sight, (height, width), zoom, draw, font) for sight in sights]
-    places = place_tags(anchors, (2.0, 2.0, width * zoom - 2.0, height * zoom - 2.0))
-    for sight, anchor, place in zip(sights, anchors, places, strict=True):
-        if abs(place[0] - anchor.xy[0]) > anchor.tag[0] or abs(place[1] - anchor.xy[1]) > anchor.tag[1]:
-            draw.line([place, anchor.xy], fill=instance_color(sight.instance_id), width=2)
-    for sight, anchor, place in zip(sights, anchors, places, strict=True):
-        _tag(draw, font, str(sight.instance_id), place, anchor.tag, instance_color(sight.instance_id))
+    targets = [_target(sight, (height, width), zoom, draw, font) for sight in sights]
+    places = place_tags(targets, (2.0, 2.0, width * zoom - 2.0, height * zoom - 2.0))
+    for sight, target, place in zip(sights, targets, places, strict=True):
+        if abs(place[0] - target.xy[0]) > target.tag[0] or abs(place[1] - target.xy[1]) > target.tag[1]:
+            draw.line([place, target.xy], fill=instance_color(sight.instance_id), width=2)
+    for sight, target, place in zip(sights, targets, places, strict=True):
+        _tag(draw, font, str(sight.instance_id), place, target.tag, instance_color(sight.instance_id))
     return image
 
 
@@ -61,7 +61,7 @@ def _tinted(rgb: NDArray[np.uint8], sights: Sequence[InstanceSight], tint: float
     return np.round(out).astype(np.uint8)
 
 
-def _anchor(
+def _target(
     sight: InstanceSight,
     size: tuple[int, int],
     zoom: int,

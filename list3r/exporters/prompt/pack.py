@@ -29,14 +29,14 @@ _OURS = "list3r-prompt.json"
 
 @dataclass(frozen=True)
 class PackSettings:
-    """What a pack shows."""
+    """Content of a pack."""
 
     tokens: int = 2000
     """Budget of the text."""
     question: str | None = None
-    """What its words name comes first."""
-    things_on_grids: int = 2000
-    """In a memory of more things the grids of the cognitive map hold only those that have a row in the text."""
+    """Instances that it names come first."""
+    objects_on_grids: int = 2000
+    """In a memory of more instances the grids of the cognitive map hold only instances with a row in the text."""
     least_visible: float = 0.3
     """Share of an instance that must show for a view to count for it."""
     least_side_px: float = 12.0
@@ -47,18 +47,18 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
     """Write scene.md, cognitive_map.json, map.png, views/ and crops/ to a folder; return the files.
 
     The views are the fewest stored keyframes that together show every listed instance. An earlier pack is replaced,
-    another folder is not, and an interruption leaves what was there. Raises `OptionError` and `ExportError`.
+    another folder is not, and an interruption leaves the earlier state. Raises `OptionError` and `ExportError`.
     """
     folder, settings = Path(folder), settings or PackSettings()
     prompt = scene_prompt(memory, settings.tokens, settings.question)
     instances = [i for i in memory.instances(structure=None) if i.state != "removed"]
-    things = {i.id for i in instances if i.structure is None}
-    listed = [n for n in prompt.listed if n in things]
+    objects = {i.id for i in instances if i.structure is None}
+    listed = [n for n in prompt.listed if n in objects]
     with replacing_folder(folder, "prompt") as temporary:
         (temporary / "scene.md").write_text(prompt.text, encoding="utf-8")
-        gridded = things if len(things) <= settings.things_on_grids else set(listed)
+        gridded = objects if len(objects) <= settings.objects_on_grids else set(listed)
         maps = cognitive_maps([i for i in instances if i.id in gridded], memory.units)
-        maps["left_out"] = len(things) - len(gridded)
+        maps["left_out"] = len(objects) - len(gridded)
         (temporary / "cognitive_map.json").write_text(json.dumps(maps, indent=1) + "\n", encoding="utf-8")
         memory.export("plan", temporary / "map.png")
         views = _write_views(memory, temporary / "views", listed, settings)
@@ -115,7 +115,7 @@ def _write_views(
 
 
 def _write_crops(memory: SceneMemory, folder: Path, listed: Sequence[int]) -> set[int]:
-    """Write the best picture of each instance; the ids of those that have one."""
+    """Write the best picture of each instance; returns the ids of instances with a picture."""
     folder.mkdir()
     written = set()
     for instance_id in listed:

@@ -14,7 +14,7 @@ def count_tokens(text: str) -> int:
 
     A word is a token for each five letters begun, a number one for each digit and one for the space before it, any
     other sign one for each byte, a line break and a stretch of other white space one. `docs/prompt.md` has the counts
-    of real tokenizers beside it.
+    of real tokenizers next to it.
     """
     return sum(_tokens_of(piece) for piece in _PIECE.findall(text))
 

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What a page holds."""
+    """Content of a page."""
 
     crops: int = 500
-    """So many instances have a picture, those seen most."""
+    """Number of instances with a picture, the most seen ones."""
     crop_px: int = 160
     """Longer side of a picture."""
 
@@ -38,7 +38,7 @@ class ReportSettings:
 def write_report(memory: SceneMemory, path: str | Path, settings: ReportSettings | None = None) -> tuple[Path, ...]:
     """Write the page. Returns the file written.
 
-    All data lie in it as JSON, which a script of ours shows as text, never as markup; a policy in its head forbids it
+    All data are in it as JSON, which a script of ours shows as text, never as markup; a policy in its head forbids it
     to load anything.
     """
     path, settings = Path(path), settings or ReportSettings()
@@ -92,7 +92,7 @@ def _numbers(values: Iterable[float]) -> list[float | None]:
 
 
 def _relations(memory: SceneMemory, instances: list[Instance]) -> list[tuple[int, str, int, float]]:
-    """Return each relation once; of two inverse ones the first of those that are told, and no `near` of `next_to`."""
+    """Return each relation once; of two inverse ones the first in the list, and no `near` of `next_to`."""
     known = {i.id for i in instances}
     inverse = {"supports": "on", "contains": "in", "below": "above"}
     found = [r for r in memory.relations() if r.subject in known and r.object in known and r.predicate not in inverse]
@@ -122,12 +122,12 @@ def _plan(memory: SceneMemory) -> str:
 
 
 def _crops(memory: SceneMemory, instances: list[Instance], settings: ReportSettings) -> dict[str, str]:
-    """Return small JPEGs by id, of those that a stored picture shows."""
+    """Return small JPEGs by id, of instances that a stored picture shows."""
     from PIL import Image
 
-    things = [i for i in instances if i.structure is None and i.state != "removed"]
+    objects = [i for i in instances if i.structure is None and i.state != "removed"]
     out = {}
-    for i in sorted(things, key=lambda i: (-i.observations, i.id))[: settings.crops]:
+    for i in sorted(objects, key=lambda i: (-i.observations, i.id))[: settings.crops]:
         try:
             crop = memory.picture(i.id).crop()
         except OptionError:  # no stored picture shows it

@@ -27,14 +27,14 @@ from list3r.memory.world.scale import lengths_of
 
 @dataclass(frozen=True)
 class SimreadySettings:
-    """What is written about props, and how they are made."""
+    """Content and making of props."""
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for no mass and no rigid body."""
     ids: tuple[int, ...] | None = None
-    """Of the things that become props; None for all."""
+    """Of the instances that become props; None for all."""
     workers: int | None = None
-    """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
+    """Worker processes; 0 for none, None for none with few props and one per core, at most 4, with many."""
     progress: Callable[[int, int], None] | None = None
     """Called with how many of the things are done, and how many there are."""
     guessed_metre: bool = False
@@ -50,12 +50,12 @@ class SimreadySettings:
 
 
 def write_simready(store: Store, folder: str | Path, settings: SimreadySettings | None = None) -> tuple[Path, ...]:
-    """Write `NAME/simready_usd/NAME.usd` for each thing of the main component and `scene.usdc`; return the files.
+    """Write `NAME/simready_usd/NAME.usd` for each instance of the main component and `scene.usdc`; return the files.
 
     Props have a closed mesh, a material, labels, a collider, a thumbnail and metadata; with a density a rigid body
-    whose mass is an estimate, marked so. Structure is fixed and lies in the scene. What was seen to move, is gone, or
-    has too few points for a mesh has no prop. Raises `OptionError` for a memory without scale and for ids that allow
-    none.
+    whose mass is an estimate, marked so. Structure is fixed and is in the scene. Moving and removed instances, and
+    those with too few points for a mesh, have no prop. Raises `OptionError` for a memory without scale and for ids
+    without a prop.
     """
     folder, settings = Path(folder), settings or SimreadySettings()
     guessed = lengths_of(store).metric == "guessed"
@@ -64,17 +64,17 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
             f"{store.path.name} has no metric scale, which a simulator needs: `list3r scale --anchor` gives it one"
             + (", --guessed-metre takes the guess" if guessed else "")
         )
-    things, structure = _chosen(store, settings)
-    parts = len(things) > settings.one_folder
+    objects, structure = _chosen(store, settings)
+    parts = len(objects) > settings.one_folder
     facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density, parts)
     with replacing_folder(folder, "simready") as temporary, errors_of_disk(folder):
         making = Making(settings.workers, settings.progress)
-        props = write_props(store, things, temporary, facts, making)
-        if settings.ids is not None and len(props) < len(things):
-            bare = sorted({i.id for i in things} - {p.instance_id for p in props})
+        props = write_props(store, objects, temporary, facts, making)
+        if settings.ids is not None and len(props) < len(objects):
+            bare = sorted({i.id for i in objects} - {p.instance_id for p in props})
             raise OptionError(f"{_names_of(bare)}: too few surface points for a mesh; leave it out of the ids")
         fixed = [(i, mesh) for i in structure if (mesh := instance_mesh(store, i)) is not None]
-        scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it lies
+        scene = Sdf.Layer.CreateNew(str(temporary / "scene.usdc"))  # references are found from where it is
         _fill_scene(Usd.Stage.Open(scene), props, fixed)
         with Sdf.ChangeBlock():  # without a stage, which would open the file of every prop
             for prop in props:
@@ -85,15 +85,15 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
 
 
 def _chosen(store: Store, settings: SimreadySettings) -> tuple[list[Instance], list[Instance]]:
-    """Return the things of the main component that become props where they have a mesh, and its structure."""
+    """Return the instances of the main component that become props where they have a mesh, and its structure."""
     there = [i for i in read_components(store)[0].instances if i.state != "removed" and has_box(i)]
-    things = [i for i in there if i.structure is None and not i.dynamic]
+    objects = [i for i in there if i.structure is None and not i.dynamic]
     if settings.ids is not None:
         wanted = {store.instances.get(n).id for n in settings.ids}
-        if bare := sorted(wanted - {i.id for i in things}):
+        if bare := sorted(wanted - {i.id for i in objects}):
             raise OptionError(f"{_names_of(bare)}: structure, gone, moving or placed apart; leave it out of the ids")
-        things = [i for i in things if i.id in wanted]
-    return things, [i for i in there if i.structure is not None]
+        objects = [i for i in objects if i.id in wanted]
+    return objects, [i for i in there if i.structure is not None]
 
 
 def _names_of(ids: Sequence[int]) -> str:
@@ -125,7 +125,7 @@ def _fill_scene(stage: Usd.Stage, props: Sequence[Prop], fixed: Sequence[tuple[I
 
 
 def _refer(layer: Sdf.Layer, prop: Prop) -> None:
-    """Add a prim that is the prop of a file, where the thing stands."""
+    """Add a prim that references a prop's file at the instance's pose."""
     spec = Sdf.CreatePrimInLayer(layer, f"/World/Props/{prop.name}")
     spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
     spec.referenceList.prependedItems = [Sdf.Reference(f"./{prop.file}")]

@@ -16,7 +16,7 @@ from list3r.pipeline.workers import OrderedPool, default_workers
 
 Some = Sequence[tuple[Instance, Support]]
 _AT_ONCE = 50
-"""Things that a process makes at a time; of fewer than four times as many no process is started unasked."""
+"""Instances that a process makes at a time; of fewer than four times as many no process is started unasked."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Making:
     """How props are made."""
 
     workers: int | None
-    """Processes; 0 for none beside this one, None for 0 of few props and as many as cores, at most 4, of many."""
+    """Worker processes; 0 for none, None for none with few props and one per core, at most 4, with many."""
     progress: Callable[[int, int], None] | None
-    """Called with how many of the things are done, and how many there are."""
+    """Called with how many of the instances are done, and how many there are."""
 
 
-def write_props(store: Store, things: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:
-    """Write a prop below `folder` for each thing whose surface points allow a mesh; in the order of the things."""
-    blocks = [things[n : n + _AT_ONCE] for n in range(0, len(things), _AT_ONCE)]
+def write_props(store: Store, shown: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:
+    """Write a prop below `folder` for each instance with enough points for a mesh; in their order."""
+    blocks = [shown[n : n + _AT_ONCE] for n in range(0, len(shown), _AT_ONCE)]
     some = ([(i, thinned_support(store, i, MeshSettings().points)) for i in block] for block in blocks)
     workers = making.workers if making.workers is not None else default_workers() if len(blocks) >= 4 else 0
     props, done = [], 0
@@ -39,7 +39,7 @@ def write_props(store: Store, things: Sequence[Instance], folder: Path, facts: P
         props += made
         done += len(block)
         if making.progress is not None:
-            making.progress(done, len(things))
+            making.progress(done, len(shown))
     return props
 
 
@@ -52,6 +52,6 @@ def _made(some: Iterator[Some], work: Callable[[Some], list[Prop]], workers: int
 
 
 def _write_some(folder: Path, facts: PropFacts, some: Some) -> list[Prop]:
-    """Write the props of some things, in the process that makes them."""
+    """Write the props of some instances, in the process that makes them."""
     meshes = ((i, mesh_of(i, support)) for i, support in some)
     return [write_prop(folder, i, mesh, facts) for i, mesh in meshes if mesh is not None]

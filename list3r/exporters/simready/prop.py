@@ -20,12 +20,12 @@ from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_materia
 from list3r.memory.geometry import Sim3
 from list3r.memory.records import Instance
 
-_NOT_TOLD = "unknown"
+_NOT_STATED = "unknown"
 
 
 @dataclass(frozen=True)
 class PropFacts:
-    """What is said of all props of an export."""
+    """Facts about all props of an export."""
 
     date: str
     """Of the export, as 2026-01-31."""
@@ -37,13 +37,13 @@ class PropFacts:
     """Whether a thousand ids share a folder."""
 
     def part(self, instance_id: int) -> str:
-        """Return the folder in which a prop lies, from that of the export."""
+        """Return the folder of a prop, relative to the export."""
         return f"from_{instance_id // 1000 * 1000}" if self.parts else ""
 
 
 @dataclass(frozen=True)
 class Prop:
-    """Where a prop lies and how it is placed."""
+    """File and pose of a prop."""
 
     name: str
     file: str
@@ -112,7 +112,7 @@ def _stage(name: str, instance: Instance, mesh: InstanceMesh, T_world_prop: Sim3
         "author": "list3r",
         "asset_name": name,
         "asset_type": "prop",
-        "asset_license": _NOT_TOLD,
+        "asset_license": _NOT_STATED,
         "category": class_token(instance),
         "source_file": facts.source_file,
         "usd_date_generated": facts.date,

@@ -15,8 +15,8 @@ _PAPER = (245, 245, 245)
 def thumbnail(vertices: NDArray[np.float64], faces: NDArray[np.int64], rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a picture of 256 x 256 px, from the front, a little from the right and above. Shape (256, 256, 3).
 
-    Faces are shaded by their slope and drawn from far to near. The mesh is closed and its faces look outward, so those
-    that look away are hidden.
+    Faces are shaded by their slope and drawn from far to near. The mesh is closed and its faces point outward, so back
+    faces are hidden.
     """
     right, back = np.array([0.8, 0.6, 0.0]), np.array([-0.5, 0.67, -0.55])
     back /= np.linalg.norm(back)

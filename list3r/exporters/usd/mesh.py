@@ -43,7 +43,7 @@ def set_vertex_colors(prim: UsdGeom.Gprim, rgb: NDArray[np.uint8]) -> None:
 
 
 def add_vertex_material(stage: Usd.Stage, path: Sdf.Path) -> UsdShade.Material:
-    """Add a material that shows the colours of vertices: a rough UsdPreviewSurface. What it is made of is unknown."""
+    """Add a material that shows the colours of vertices: a rough UsdPreviewSurface. The real material is unknown."""
     material = UsdShade.Material.Define(stage, path)
     surface = UsdShade.Shader.Define(stage, path.AppendChild("surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -61,12 +61,12 @@ def add_vertex_material(stage: Usd.Stage, path: Sdf.Path) -> UsdShade.Material:
 
 
 def bind(prim: Usd.Prim, material: UsdShade.Material) -> None:
-    """Bind a material to a prim and what is below it."""
+    """Bind a material to a prim and its children."""
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
 def add_collider(mesh: UsdGeom.Mesh, *, fixed: bool) -> None:
-    """Make a mesh collide: its convex hull, or of what is fixed the triangles themselves."""
+    """Make a mesh collide: its convex hull, or its triangles where it is fixed."""
     UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
     shape = UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim())
     shape.CreateApproximationAttr(UsdPhysics.Tokens.none if fixed else UsdPhysics.Tokens.convexHull)

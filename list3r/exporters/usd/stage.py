@@ -28,16 +28,16 @@ from list3r.memory.store.store import Store
 
 @dataclass(frozen=True)
 class UsdSettings:
-    """What goes into the stage."""
+    """Content of the stage."""
 
     points_per_instance: int = 5000
-    """At most this many points of a thing."""
+    """At most this many points of an instance."""
     points_per_structure: int = 20000
     """At most this many points of a floor, a wall and the like."""
     mesh: bool = False
     """Whether instances and structure have a closed mesh too; their points are then invisible."""
     colliders: bool = False
-    """Whether meshes collide, structure as it is and things by their convex hull; asks for meshes."""
+    """Whether meshes collide, structure as it is and instances by their convex hull; asks for meshes."""
 
     def __post_init__(self) -> None:
         if min(self.points_per_instance, self.points_per_structure) < 0:
@@ -64,7 +64,7 @@ def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = Non
 
 @contextlib.contextmanager
 def errors_of_disk(path: Path) -> Iterator[None]:
-    """Raise `ExportError` for what USD cannot write of an export."""
+    """Raise `ExportError` for failures of USD."""
     try:
         yield
     except Tf.ErrorException as error:
@@ -86,9 +86,9 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
     """Build stage in memory: z up, metersPerUnit 1 (arbitrary units in a relative memory, `customLayerData` says so).
 
     `/World/Instances/instance_12` is the box's own frame (translate, orient), with the points in it and the box as a
-    guide; what moves has a sample of its translation for each frame that saw it. Floor, walls and the like are under
-    `/World/Structure`; time codes are frame numbers of the source. A component that was not placed against the main
-    one is under `/World/component_7`, invisible, so that it is not overlaid.
+    guide; a moving instance has a sample of its translation for each frame that saw it. Floor, walls and the like are
+    under `/World/Structure`; time codes are frame numbers of the source. Another component is under
+    `/World/component_7`, invisible, so that it is not overlaid.
     """
     settings = settings or UsdSettings()
     components = read_components(store)
@@ -144,9 +144,8 @@ def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:
 def _add_together(
     stage: Usd.Stage, scope: Sdf.Path, instances: Sequence[Instance], store: Store, settings: UsdSettings
 ) -> dict[int, Sdf.Path]:
-    """Add instances by way of a stage of their own; return their paths.
-
-    Whatever is set on a stage costs time that grows with what the stage holds already.
+    """Add instances through a stage of their own; return their paths. The cost of each edit grows with the size of its
+    stage.
     """
     part = Usd.Stage.CreateInMemory()
     UsdGeom.Xform.Define(part, scope)
@@ -157,7 +156,7 @@ def _add_together(
 
 
 def _take_over(part: Sdf.Layer, layer: Sdf.Layer, path: Sdf.Path) -> None:
-    """Copy what lies under a path in one layer into another; what is there already stays."""
+    """Copy the prims under a path in one layer into another; existing ones stay."""
     for spec in part.GetPrimAtPath(path).nameChildren:
         if layer.GetPrimAtPath(spec.path):
             _take_over(part, layer, spec.path)
@@ -182,7 +181,7 @@ def _add_instance(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, support
     xform = UsdGeom.Xform.Define(stage, path)
     prim = xform.GetPrim()
     Usd.ModelAPI(prim).SetKind("component")
-    prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'thing'} #{instance.id}")
+    prim.SetDisplayName(f"{instance.label or instance.description or instance.structure or 'object'} #{instance.id}")
     set_labels(prim, instance)
     prim.SetDocumentation(instance.description or class_token(instance))
     _set_facts(prim, instance)
@@ -225,7 +224,7 @@ def _add_surface(stage: Usd.Stage, path: Sdf.Path, instance: Instance, store: St
 
 
 def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:
-    """Add samples of a moving thing's place, as it is turned where it was last; time codes are frame numbers."""
+    """Add samples of a moving instance's place, as it is turned where it was last; time codes are frame numbers."""
     keys, _, places = store.tracks.frames(instance.id)
     if not len(keys):
         return

@@ -1,9 +1,9 @@
-"""What came and went between sessions teaches what was there: surfaces that another session sees through.
+"""Instances found because they changed: surfaces of one session that another session sees through.
 
-A thing that discovery overlooked, or took for part of what it stands on, shows itself when it goes: its surface is in
-the keyframes of one session, and those of the other look through it. Such surfaces, gathered chunk by chunk into
-clusters, become local instances of the chunk that saw them, with masks in its frames, so that merging and the story of
-changes treat them like any other. Only what no instance of the chunk stands for already is added.
+Discovery may miss an object or segment it as part of its support. Once the object is gone, its surface is in the
+keyframes of one session and carved free by those of another. Such surfaces, clustered per chunk, become local instances
+of the chunk that saw them, with masks in its frames, so that merging and change detection treat them like any other.
+Only surfaces that no instance of the chunk explains are added.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ __all__ = ["ChangedPlaceSettings", "add_changed_places"]
 
 
 def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSettings | None = None) -> int:
-    """Add local instances for what a session shows to have gone or come and no instance stands for; how many.
+    """Add local instances for changed surfaces that no instance explains; returns how many.
 
-    Call inside a transaction, after the chunks are placed. Chunks whose features are not of the space that is computed
-    here are left as they are.
+    Call inside a transaction, after the chunks are placed. Chunks with features of another embedding space are left
+    unchanged.
     """
     s = settings or ChangedPlaceSettings()
     chunks = store.chunks.all()
@@ -69,8 +69,8 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         came = [left[c.chunk_id] for c in here if _is(c, session_id) != _is(chunk, session_id)]
         nodes = store.local_instances.nodes([chunk.chunk_id])
         place = _Change(left[chunk.chunk_id], came, compared(seen, s), unit, s)
-        standing = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
-        clusters = _unexplained(place, nodes, standing, chunk)
+        explain = [place.explains(chunk.S_world_chunk.apply(n.support.points.astype(np.float64))) for n in nodes]
+        clusters = _unexplained(place, nodes, explain, chunk)
         if not clusters:
             continue
         frames = [f for f in store.frames.all(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
@@ -79,10 +79,10 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         in_chunk = unit / float(chunk.S_world_chunk.scale)
         following = store.local_instances.next_id(chunk.chunk_id)
         for cluster in clusters:
-            thing = maker.make(following, cluster)
-            if thing is not None:
-                store.local_instances.add(chunk.chunk_id, thing)
-                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(thing, nodes, standing, in_chunk, s))
+            obj = maker.make(following, cluster)
+            if obj is not None:
+                store.local_instances.add(chunk.chunk_id, obj)
+                store.chunks.add_cannot_links(chunk.chunk_id, _mixed_with(obj, nodes, explain, in_chunk, s))
                 following += 1
                 added += 1
     return added
@@ -92,32 +92,32 @@ def _is(chunk: ChunkRow, session_id: int) -> bool:
     return chunk.session_id == session_id
 
 
-# ---------------------------------------------------------------------------------------------- what stands for it
+# ------------------------------------------------------------------------------------------------- explained by
 
 
 def _clusters(points: Array, unit: float, s: ChangedPlaceSettings) -> list[Ints]:
-    """Rows of connected surfaces that are large enough for a thing, the largest first."""
+    """Rows of connected surfaces that are large enough for an object, the largest first."""
     if len(points) < s.least_cells:
         return []
     pairs = cKDTree(points).query_pairs(s.link_m * unit, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
     _, label = connected_components(graph, directed=False)
     rows = [np.flatnonzero(label == n) for n in range(int(label.max()) + 1)]
-    kept = [r for r in rows if _is_thing(points[r], unit, s)]
+    kept = [r for r in rows if _is_object(points[r], unit, s)]
     return sorted(kept, key=lambda r: (-len(r), int(r[0])))
 
 
-def _is_thing(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
+def _is_object(points: Array, unit: float, s: ChangedPlaceSettings) -> bool:
     sides = np.sort(np.ptp(points, axis=0))
     large = float(np.linalg.norm(sides)) > s.largest_m * unit
     return len(points) >= s.least_cells and sides[1] >= s.least_side_m * unit and not large
 
 
 class _Change:
-    """What one chunk shows to have changed, world coordinates.
+    """Changed surfaces of one chunk, world coordinates.
 
-    `gone` are its surfaces that the other sessions see through, `came` theirs that it sees through, `compared` its
-    surfaces that the others see or see through. Shapes (N, 3).
+    `gone` are its surfaces that the other sessions see through, `came` the surfaces of others that it sees through,
+    `compared` all that the others observe. Shapes (N, 3).
     """
 
     def __init__(
@@ -128,10 +128,10 @@ class _Change:
         self._either = cKDTree(np.concatenate([gone, *came]))
 
     def explains(self, support: Array) -> bool:
-        """Return whether all of an instance has changed: what is not seen through lies where something else stands now.
+        """Return whether a whole instance has changed: its points are carved free or replaced by another surface.
 
-        Two solid things that stood at one place leave surfaces that both sessions measure, so an instance is not asked
-        to be seen through as a whole; what reaches beyond the change is a mixture of what went with what stayed.
+        Two solid objects at one place share surfaces that both sessions measure, so not all of an instance must be seen
+        through. An instance that extends beyond the change mixes removed and unchanged surfaces.
         """
         reach, link = 1.5 * self.settings.voxel_m * self.unit, self.settings.link_m * self.unit
         if len(support) == 0 or len(self.gone) == 0:
@@ -143,22 +143,22 @@ class _Change:
         return bool(known.any() and float(np.mean(near[known])) >= self.settings.explained)
 
 
-def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[bool], chunk: ChunkRow) -> list[Array]:
-    """Clusters of surfaces that are gone and that no instance of the chunk stands for. Shapes (N, 3)."""
+def _unexplained(place: _Change, nodes: Sequence[LocalNode], explain: Sequence[bool], chunk: ChunkRow) -> list[Array]:
+    """Clusters of surfaces that are gone and that no instance of the chunk explains. Shapes (N, 3)."""
     s, unit, points = place.settings, place.unit, place.gone
     clusters = _clusters(points, unit, s)
     if not clusters:
         return []
     reach = 1.5 * s.voxel_m * unit
-    stood_for = np.zeros(len(points), bool)
-    for node, stands in zip(nodes, standing, strict=True):
-        if stands:
+    taken = np.zeros(len(points), bool)
+    for node, does in zip(nodes, explain, strict=True):
+        if does:
             support = chunk.S_world_chunk.apply(node.support.points.astype(np.float64))
-            stood_for |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
+            taken |= cKDTree(support).query(points, distance_upper_bound=reach)[0] < np.inf
     out = []
     for rows in clusters:
-        left = rows[~stood_for[rows]]
-        if len(left) >= (1.0 - s.scrap) * len(rows):
+        left = rows[~taken[rows]]
+        if len(left) >= (1.0 - s.explained_share) * len(rows):
             out.append(points[rows])
         else:
             out += [points[left[r]] for r in _clusters(points[left], unit, s) if len(r) >= s.part * len(rows)]
@@ -166,21 +166,21 @@ def _unexplained(place: _Change, nodes: Sequence[LocalNode], standing: Sequence[
 
 
 def _mixed_with(
-    thing: LocalInstance, nodes: Sequence[LocalNode], standing: Sequence[bool], unit: float, s: ChangedPlaceSettings
+    obj: LocalInstance, nodes: Sequence[LocalNode], explain: Sequence[bool], unit: float, s: ChangedPlaceSettings
 ) -> list[tuple[int, int]]:
-    """Pairs of a thing with the chunk's instances that hold part of it beside what stayed: they are not this thing."""
+    """Cannot-link pairs of an object with the chunk's instances that mix part of it with unchanged surfaces."""
     reach = 1.5 * s.voxel_m * unit
     out = []
-    for node, stands in zip(nodes, standing, strict=True):
-        if stands or len(node.support.points) == 0:
+    for node, does in zip(nodes, explain, strict=True):
+        if does or len(node.support.points) == 0:
             continue
-        covered = cKDTree(node.support.points).query(thing.support.points, distance_upper_bound=reach)[0] < np.inf
+        covered = cKDTree(node.support.points).query(obj.support.points, distance_upper_bound=reach)[0] < np.inf
         if float(np.mean(covered)) >= s.mixed:
-            out.append((node.local_id, thing.local_id))
+            out.append((node.local_id, obj.local_id))
     return out
 
 
-# ---------------------------------------------------------------------------------------------- what becomes of it
+# ------------------------------------------------------------------------------------------------------- result
 
 
 class _Maker:

@@ -1,6 +1,5 @@
-"""What the frames of one session tell about the surfaces of another: which of them are seen through.
-
-Surfaces are asked about cell by cell, and a frame only about those that it may see.
+"""Free-space carving between sessions: which surfaces of one do the frames of the other see through? Surfaces are
+tested cell by cell, in the frames that may see the cell.
 """
 
 from __future__ import annotations
@@ -21,40 +20,38 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ChangedPlaceSettings:
-    """When surfaces that another session sees through are a thing."""
+    """When surfaces that another session sees through are an object."""
 
     voxel_m: float = 0.02
     """Edge of the cells in which a chunk's surfaces are asked about."""
-    least_told: int = 2
+    least_frames: int = 2
     """Frames of the other session that must see through a surface, and of its own that must see it."""
     free_share: float = 0.7
-    """Share of the other session's frames that tell about a surface and must see through it."""
+    """Share of the other session's frames observing a surface that must see through it."""
     own_free: float = 0.25
     """Share of its own session's frames up to which they may do so: else it is noise or moves."""
     link_m: float = 0.045
-    """Surfaces within this distance are one thing."""
+    """Surfaces within this distance are one object."""
     least_cells: int = 12
-    """Cells of the smallest thing."""
+    """Cells of the smallest object."""
     least_side_m: float = 0.05
     """Its second longest side."""
     largest_m: float = 1.2
-    """Diagonal of the largest; what is larger is a door, a curtain, or an error of placing."""
+    """Diagonal of the largest; larger ones are doors, curtains or registration errors."""
     explained: float = 0.7
-    """Share of an instance that must lie at what is gone, or at what came in its place, for it to stand for what is
-    gone there; of what the other session tells about."""
+    """Share of an instance's observed points at removed or replaced surfaces, for it to explain the change."""
     mixed: float = 0.2
-    """Share of a found thing that lies on another instance of the chunk, which does not stand for it, for the two to
-    be kept apart."""
-    scrap: float = 0.35
-    """Share of a cluster up to which what stands for it is a scrap of the thing, which is found anew as a whole."""
+    """Share of a found object on another instance of the chunk that does not explain it, for a cannot-link."""
+    explained_share: float = 0.35
+    """A cluster of which instances explain at most this share is segmented again as a whole object."""
     part: float = 0.3
-    """Share of a cluster that its unexplained rest must have, to be a thing of its own."""
+    """Share of a cluster that its unexplained rest must have, to be an object of its own."""
     least_mask_px: int = 12
     """Pixels of the small depth image in which a keyframe must see it."""
     block_m: float = 0.5
-    """Edge of the cells by which a frame is asked only about what it may see."""
+    """Edge of the cells that are tested against a frame's view."""
     max_points: int = 2500
-    """Support points of one thing."""
+    """Support points of one object."""
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
 
 
@@ -95,12 +92,12 @@ def ask(own: Sequence[DepthView], others: Sequence[DepthView], unit: float, s: C
             free[rows[seen == FREE]] += 1
         counts[name] = met, free
     met, free = counts["own"]
-    sure = (met >= s.least_told) & (free <= s.own_free * met)
+    sure = (met >= s.least_frames) & (free <= s.own_free * met)
     return CarvedSurfaces(points, counts["others"][1], counts["others"][0], sure)
 
 
 class _SurfaceBlocks:
-    """Points sorted into large cells, so that a frame is asked only about those that it may see."""
+    """Points sorted into large cells, so that a frame tests only those in its view."""
 
     def __init__(self, points: Array, edge: float) -> None:
         block = np.floor(points / edge).astype(np.int64)
@@ -128,7 +125,7 @@ class _SurfaceBlocks:
 def _cells(
     lifted: Sequence[tuple[Array, Ints, Ints]], views: Sequence[DepthView], unit: float, s: ChangedPlaceSettings
 ) -> Array:
-    """One mean point for each occupied cell, of what lies within reach. Shape (N, 3)."""
+    """The mean point of each occupied cell, of points within reach. Shape (N, 3)."""
     parts = []
     for (p, row, column), view in zip(lifted, views, strict=True):
         parts.append(p[view.depth[row, column] < s.visibility.most_depth_m * view.unit])
@@ -142,10 +139,10 @@ def _cells(
 
 def gone(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     """Return the surfaces that the other sessions see through. Shape (N, 3)."""
-    through = (seen.free >= s.least_told) & (seen.free >= s.free_share * (seen.free + seen.met))
+    through = (seen.free >= s.least_frames) & (seen.free >= s.free_share * (seen.free + seen.met))
     return np.asarray(seen.points[seen.own & through])
 
 
 def compared(seen: CarvedSurfaces, s: ChangedPlaceSettings) -> Array:
     """Return the surfaces that the other sessions see or see through. Shape (K, 3)."""
-    return np.asarray(seen.points[seen.free + seen.met >= s.least_told])
+    return np.asarray(seen.points[seen.free + seen.met >= s.least_frames])

@@ -54,7 +54,7 @@ def unpack(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def key_shift(offset: tuple[int, int, int]) -> int:
-    """What to add to a key to get that of a neighbouring cell."""
+    """Offset from a key to that of a neighbouring cell."""
     return (offset[0] << (2 * _BITS)) + (offset[1] << _BITS) + offset[2]
 
 

@@ -1,4 +1,4 @@
-"""A cut of the chunk's cloud into things, looked at from each anchor."""
+"""A cut of the chunk's cloud into objects, rendered at each anchor."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from list3r.reconstruction.base import Reconstruction
 
 @dataclass(frozen=True)
 class Segment:
-    """One thing of the chunk."""
+    """One object of the chunk."""
 
     plane: NDArray[np.float64] | None
     """Its plane in chunk coordinates where it is flat. Shape (4,)."""
     structure: bool
     """A surface that bounds the room."""
     score: float
-    """How sure it is one thing, in [0, 1]."""
+    """How sure it is one object, in [0, 1]."""
     named: tuple[tuple[str, float], ...] = ()
     """Names that it may have, with their probabilities."""
 
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Every voxel's thing."""
+    """Every voxel's object."""
 
     labels: NDArray[np.int32]
     """0 for none, s + 1 for segment s. Shape (N,)."""
@@ -44,9 +44,8 @@ class Segmentation:
 
 
 class CloudDiscoverer(ABC):
-    """Proposes the things of the chunk's fused cloud as masks on an anchor; how it is cut, others say.
-
-    The cloud of a chunk is cut once, at the first anchor; the other anchors look at the same cut.
+    """Proposes the objects of the chunk's fused cloud as masks on an anchor; subclasses segment it. The cloud of a
+    chunk is segmented once, at the first anchor; the others render the same segments.
     """
 
     feature_space = FEATURE_SPACE
@@ -61,9 +60,9 @@ class CloudDiscoverer(ABC):
         views = chunk_views(frames, reconstruction, self.settings)
         if views is not self._views or self._cut is None:
             self._views, self._cut = views, self._segment(views)
-        return self.looked_at(reconstruction, position, *self._cut[1:])
+        return self.propose(reconstruction, position, *self._cut[1:])
 
-    def looked_at(
+    def propose(
         self, reconstruction: Reconstruction, position: int, cut: Segmentation, features: NDArray[np.float32]
     ) -> Proposals:
         """A cut of the cloud of the chunk in hand, as the frame at `position` sees it."""

@@ -13,7 +13,7 @@ _LIGHT_BINS = 12
 def object_feature(
     points: NDArray[np.float32], rgb: NDArray[np.uint8], up: NDArray[np.float64], unit: float
 ) -> NDArray[np.float32]:
-    """Unit-length feature of a thing from its surface points (N, 3), colours (N, 3) and the upward direction. (64,).
+    """Unit-length feature of an object from its surface points (N, 3), colours (N, 3) and the upward direction. (64,).
 
     Square roots of soft histograms (so that the inner product is the Bhattacharyya coefficient) of chroma and
     lightness, and soft codes of the sizes along and across the vertical and of flatness.
@@ -30,11 +30,11 @@ def object_feature(
 
 
 COLOR_PART = _CHROMA_BINS + _LIGHT_BINS
-"""The first numbers of a feature tell the colours, the rest the shape."""
+"""The first numbers of a feature describe colour, the rest shape."""
 
 
 def color_feature(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The colour part of `object_feature`, of unit length: all that a picture without depth tells. (N, 3) -> (36,)."""
+    """The colour part of `object_feature`, of unit length: usable without depth. (N, 3) -> (36,)."""
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255.0, cv2.COLOR_RGB2Lab)[0]
     part = np.concatenate([_chroma_histogram(lab), np.sqrt(0.5) * _soft_histogram(lab[:, 0] / 100.0, _LIGHT_BINS)])
     return np.asarray(part / max(float(np.linalg.norm(part)), 1e-9), dtype=np.float32)

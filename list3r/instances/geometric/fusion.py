@@ -59,7 +59,7 @@ def intrinsics_of(camera: Camera) -> Intrinsics:
 
 
 def depth_edges(depth: Float, sigma: Float) -> NDArray[np.bool_]:
-    """Pixels beside a jump of depth or a hole."""
+    """Pixels next to a jump of depth or a hole."""
     kernel = np.ones((3, 3), np.uint8)
     far = np.where(depth > 0, depth, np.float32(1e3))
     low, high = cv2.erode(far, kernel), cv2.dilate(depth, kernel)

@@ -29,7 +29,7 @@ def read_across(
 
 
 @compiled
-def carry_labels(
+def propagate_labels(
     depth: Float,
     camera: Intrinsics,
     T_source_cam: Float,
@@ -39,7 +39,7 @@ def carry_labels(
     """Labels of a source view looked up from a depth image, and where the source shows the same surface. (h, w) each.
 
     `source` is its depth and its labels; `law` the noise of depth, base + quadratic * z^2 in metres, the units of a
-    metre, the scale of the noise, and what is tolerated beside four deviations.
+    metre, the scale of the noise, and the tolerance added to four deviations.
     """
     read, labels = source
     base, quadratic, unit, scale, tolerated = law
@@ -70,7 +70,7 @@ def _pixel(
     other: Intrinsics,
     shape: tuple[int, int],
 ) -> tuple[int, np.float32]:
-    """Which pixel of another camera shows what one of a depth image does, -1 for none, and its depth there."""
+    """The pixel of another camera that sees the surface of each depth pixel, -1 for none, and its depth there."""
     row, column = place
     u, v = (np.float32(column) - camera[2]) / camera[0], (np.float32(row) - camera[3]) / camera[1]
     T = T_other_cam
@@ -105,8 +105,8 @@ def without_lone(labels: Labels) -> tuple[Labels, Labels]:
             alike = np.int32(over[k] == here) + np.int32(over[k + 1] == here) + np.int32(over[k + 2] == here)
             alike += np.int32(on[k] == here) + np.int32(on[k + 2] == here)
             alike += np.int32(under[k] == here) + np.int32(under[k + 1] == here) + np.int32(under[k + 2] == here)
-            beside = max(np.int32(0), over[k], over[k + 1], over[k + 2], on[k], on[k + 2])
-            most[row, k] = max(beside, under[k], under[k + 1], under[k + 2])
+            around = max(np.int32(0), over[k], over[k + 1], over[k + 2], on[k], on[k + 2])
+            most[row, k] = max(around, under[k], under[k + 1], under[k + 2])
             kept[row, k] = here if alike >= 3 else 0
     return kept, most
 
@@ -117,7 +117,7 @@ def label_runs(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Labels]:
     """Runs of pixels of one label above 0: where each starts and stops in an image (height, width), and its label.
 
-    Each pixel of `labels` stands for `stride` by `stride` pixels of that image.
+    Each pixel of `labels` represents `stride` by `stride` pixels of that image.
     """
     room, count = 64 + labels.size // 4, 0
     starts, stops, value = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int32)
@@ -143,7 +143,7 @@ def label_runs(
 
 @compiled
 def meeting(keys: NDArray[np.int64], shift: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Positions of ascending keys that others are `shift` beyond, and those of these others. Shape (H,) each."""
+    """Positions of ascending keys k with k + `shift` among the keys, and of k + `shift`. Shape (H,) each."""
     here, there = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
     count, at = 0, 0
     for k in range(len(keys)):

@@ -27,7 +27,7 @@ class Raster:
     """(rows, columns): rows along the second axis."""
 
     def cells(self, points: Float) -> NDArray[np.int64]:
-        """(row, column) of points, which may lie outside. Shape (N, 3) -> (N, 2)."""
+        """(row, column) of points, which may be outside. Shape (N, 3) -> (N, 2)."""
         local = (points - self.origin) @ self.axes.T / self.cell
         return np.floor(local[:, ::-1]).astype(np.int64)
 
@@ -62,9 +62,9 @@ class Plane:
 
 
 def plane_tolerance(cloud: Cloud) -> Float:
-    """How far from a plane a voxel may lie and still belong to it. Shape (N,).
+    """How far from a plane a voxel may be and still belong to it. Shape (N,).
 
-    Fused noise, or what bending of depth and pose drift leave between views, which is about that of single readings.
+    Fused noise, or the residual of depth bias and pose drift between views, about the noise of a single reading.
     """
     return np.asarray(0.6 * cloud.voxel + np.maximum(3.5 * cloud.sigma, 2.0 * cloud.reading), dtype=np.float32)
 

@@ -46,16 +46,16 @@ def collect_supports(
 
 
 RIM_STEP = 0.02
-"""Step of depth within one pixel, over the depth, at which an outline stands before something farther."""
+"""Step of depth within one pixel, over the depth, at which an outline occludes something farther."""
 RIM_LEAST = 0.3
 """Least share of its pixels that an instance keeps, else it is nothing but rim and keeps all."""
 
 
 def without_rims(image: NDArray[np.int32], depth: NDArray[np.float32], count: int) -> NDArray[np.int32]:
-    """Return a label image without the pixels at outlines that stand before something farther.
+    """Return a label image without the pixels at occluding outlines.
 
-    Depth computed from pictures compares windows of them. Windows at such an outline hold both surfaces, so that what
-    lies behind is drawn forward and hangs on the instance like a skirt (research/colour-video 0140).
+    Depth computed from pictures compares windows of them. Windows at such an outline hold both surfaces, so the
+    background is pulled forward and fringes the instance (research/colour-video 0140).
     """
     label, around = image.astype(np.float32), np.ones((3, 3), np.uint8)
     inner = (cv2.erode(label, around) == label) & (cv2.dilate(label, around) == label)
@@ -65,17 +65,16 @@ def without_rims(image: NDArray[np.int32], depth: NDArray[np.float32], count: in
 
 
 FLIER_VOXEL_M = 0.02
-"""Grain at which points are counted to find those that fly."""
+"""Voxel edge for counting points, to find flying points."""
 FLIER_SHARE = 0.15
-"""Points of a voxel, over those of the voxel of a usual point of the thing, below which it holds readings that fly.
-Both chosen on seeds 5000 to 5009 and walks 1 to 6 of the house (research/discovery 0081)."""
+"""Points of a voxel, relative to the median of the object's points, below which they are flying points. Both chosen on
+seeds 5000 to 5009 and walks 1 to 6 of the house (research/discovery 0081)."""
 
 
 def without_fliers(points: NDArray[np.float32], unit: float) -> NDArray[np.int64]:
     """Return positions of the points that others confirm, ascending.
 
-    Readings that fly at outlines lie where few others do: many views show the surface, one shows the flier. Shape
-    (N, 3) -> (M,).
+    Flying points at outlines are isolated: many views show the surface, one shows the outlier. Shape (N, 3) -> (M,).
     """
     _, inverse, number = np.unique(
         pack(np.floor(points / (FLIER_VOXEL_M * unit)).astype(np.int64)), return_inverse=True, return_counts=True
@@ -93,7 +92,7 @@ def thin(
     unit: float,
     max_points: int,
 ) -> Support:
-    """Support of one mean point in each voxel: 5 mm for small things, larger so that at most `max_points` are left."""
+    """Support of one mean point in each voxel: 5 mm for small objects, larger so that at most `max_points` are left."""
     if not len(points):
         return Support(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8))
     voxel = 0.005 * unit

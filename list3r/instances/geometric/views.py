@@ -1,4 +1,4 @@
-"""Anchor views: the depth of neighbouring frames fused into one frame, with normals and what the noise leaves."""
+"""Anchor views: the depth of neighbouring frames fused into one frame, with normals and the remaining noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from list3r.instances.geometric.fusion import (
     small_color,
 )
 from list3r.instances.geometric.kernels import read_across
-from list3r.instances.geometric.registration import align_views, moved_view
+from list3r.instances.geometric.view_alignment import align_views, moved_view
 from list3r.instances.settings import AnchorViewSettings, InstanceSettings
 from list3r.reconstruction.base import Reconstruction, backproject
 
@@ -69,7 +69,7 @@ class ChunkViews:
 
     @property
     def noise_law(self) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-        """What `sigma` reckons with: base and quadratic share in metres, units of a metre, and a scale."""
+        """Noise law of `sigma`: base and quadratic share in metres, units of a metre, and a scale."""
         computed, read = self.reconstruction.depth_noise, self.settings.view.noise
         if computed is not None:
             return np.float32(computed.base), np.float32(computed.quadratic), np.float32(1), np.float32(1)
@@ -101,7 +101,7 @@ class ChunkViews:
         return read_across(depth, cameras[0], moved.astype(np.float32), cameras[1], there)
 
     def _most_sigma(self, depth: Float) -> Float:
-        """Standard deviation beyond which depth shows no things. Shape (...)."""
+        """Standard deviation beyond which depth shows no objects. Shape (...)."""
         view = self.settings.view
         share = 0.0 if self.reconstruction.depth_noise is None else view.max_computed
         return np.asarray(np.maximum(view.max_sigma_m * self.unit, share * depth), np.float32)
@@ -138,7 +138,7 @@ _LAST: list[tuple[weakref.ref[Reconstruction], InstanceSettings, ChunkViews]] = 
 
 
 def chunk_views(frames: Sequence[Frame], reconstruction: Reconstruction, settings: InstanceSettings) -> ChunkViews:
-    """The views of a chunk; those of the latest chunk are kept, so that discovery and tracking share them."""
+    """The views of a chunk; the latest chunk's are cached, so that discovery and tracking share them."""
     if _LAST and _LAST[0][0]() is reconstruction and _LAST[0][1] == settings:
         return _LAST[0][2]
     views = ChunkViews(frames, reconstruction, settings)

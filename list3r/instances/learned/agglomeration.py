@@ -1,4 +1,4 @@
-"""Pieces joined to things by the affinity of their borders."""
+"""Pieces joined to objects by the affinity of their borders."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def agglomerate(
     """Return the cluster of each of `count` pieces, numbered from 0 in order of their first piece.
 
     Clusters whose mean affinity (log odds, weighted by the length of their borders) is above the threshold are joined,
-    the most alike first: average linkage. Pairs that are each other's most alike are joined side by side, which gives
-    the same as one after the other, since a join never brings what is joined nearer to a third.
+    the most similar first: average linkage. Mutual nearest neighbours are joined in parallel, with the same result as
+    in sequence, since average linkage is reducible: a join is never nearer to a third cluster.
     """
     own = np.arange(count)
     score = np.clip(affinity.astype(np.float64), -STRONGEST, STRONGEST)

@@ -1,8 +1,8 @@
-"""What a cut of computed depth says that its own errors may have made: bends of walls, and slivers.
+"""Segments that errors of computed depth may have made: bent walls and slivers.
 
-Computed depth is off by more than it is rough, alike over a patch, so that a patch of a wall stands before it like a
-thing. Two things that the networks do not see tell them apart: how far depth may be off there, and whether the picture
-shows a border round the patch (research/discovery 0088).
+Computed depth has a bias that is larger than its noise and constant over a patch, so a patch of a wall can float before
+it like an object. Two cues that the networks do not have decide: the possible depth error there, and whether the
+picture shows a border round the patch (research/discovery 0088).
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from list3r.instances.learned.graph import ChunkSurface
 
 @dataclass(frozen=True)
 class DepthErrorSettings:
-    """What the errors of computed depth explain; chosen on walks 41 and 42 of `benchmarks/colour.py`."""
+    """Limits of depth-error segments, chosen on walks 41 and 42 of `benchmarks/colour.py`."""
 
     deviations: float = 2.0
-    """Deviations of depth within which a voxel may lie in a plane."""
+    """Deviations of depth within which a voxel may be in a plane."""
     within: float = 0.75
-    """Share of a thing's voxels that do, for its shape to say nothing."""
+    """Share of an object's voxels that do, for its shape to say nothing."""
     step: float = 3.2
-    """Median step of colour across the rim of a thing, Lab with lightness halved, below which the picture shows
-    no border. Patches of walls and floors had 0.9 to 2.6, pictures, rugs and bed-covers 4 to 28."""
+    """Median step of colour across the rim of an object, Lab with lightness halved, below which the picture shows no
+    border. Patches of walls and floors had 0.9 to 2.6, pictures, rugs and bed-covers 4 to 28."""
     reach_px: int = 4
     """Pixels between the two sides of a rim that are compared."""
     least_spread: float = 0.58
-    """Deviation of a thing's points along the second of its axes over that of its depth, below which it is a scrap:
-    that of a bar as wide as what its depth may be off by to either side."""
+    """Deviation of an object's points along the second of its axes over that of its depth, below which it is a sliver:
+    as narrow as the depth error to either side."""
 
 
 def voxel_doubt(views: ChunkViews, cloud: Cloud) -> NDArray[np.float32]:
@@ -52,11 +52,11 @@ def voxel_doubt(views: ChunkViews, cloud: Cloud) -> NDArray[np.float32]:
     return np.asarray(total / np.maximum(count, 1.0), np.float32)
 
 
-def without_bends(
+def without_depth_bends(
     surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane], doubt: NDArray[np.float32], s: DepthErrorSettings
 ) -> CloudCut:
-    """Return the cut with what is a patch of a wall or floor joined to it: what lies in the plane of a structure within
-    the doubt of depth (N,), and what no border in the pictures parts from what is round it.
+    """Return the cut with patches of walls and floors joined to them: segments in the plane of a structure within the
+    depth error `doubt` (N,), without a border in the pictures.
     """
     structure = cut.verdicts.structure > 0.5
     held = np.append(structure, False)[cut.labels]
@@ -79,7 +79,7 @@ def without_bends(
 
 
 def rim_steps(surface: ChunkSurface, cut: CloudCut, reach_px: int) -> NDArray[np.float64]:
-    """Return the median step of colour across the rim of each thing, where beyond it is structure or nothing known.
+    """Return the median step of colour across the rim of each object, where beyond it is structure or nothing known.
     Infinite where nothing is. Shape (T,).
     """
     count = len(cut.verdicts.structure)
@@ -106,9 +106,7 @@ def rim_steps(surface: ChunkSurface, cut: CloudCut, reach_px: int) -> NDArray[np
 def without_slivers(
     cloud: Cloud, cut: CloudCut, doubt: NDArray[np.float32], s: DepthErrorSettings, most: float
 ) -> CloudCut:
-    """Return the cut in which what is narrower than the doubt of its depth (N,) is one whole with at most the
-    probability `most`.
-    """
+    """Return the cut in which segments narrower than their depth error (N,) are whole with at most `most`."""
     whole = cut.verdicts.whole.copy()
     for number in np.flatnonzero((cut.verdicts.structure <= 0.5) & (whole > most)).tolist():
         mine = np.flatnonzero(cut.labels == number)

@@ -1,4 +1,4 @@
-"""The discoverer whose weights are our own: trained networks over pieces of the chunk's cloud."""
+"""The default discoverer: networks of our own over pieces of the chunk's cloud."""
 
 from __future__ import annotations
 
@@ -17,46 +17,46 @@ from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.planes import Plane, estimate_up, find_planes
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.learned.cut import CloudCut, CutSettings, cut_cloud
-from list3r.instances.learned.depth_errors import DepthErrorSettings, voxel_doubt, without_bends, without_slivers
+from list3r.instances.learned.depth_errors import DepthErrorSettings, voxel_doubt, without_depth_bends, without_slivers
 from list3r.instances.learned.graph import ChunkSurface, Surroundings, chunk_surface
-from list3r.instances.learned.things import ThingVerdicts, names_of
+from list3r.instances.learned.verdicts import SegmentVerdicts, names_of
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import InstanceSettings
 from list3r.reconstruction.base import Reconstruction
 
 Features = NDArray[np.float32]
-"""Unit features of T things. Shape (T, D)."""
+"""Unit features of T objects. Shape (T, D)."""
 OFF_WALL = 4.0
-"""Voxels, besides three deviations of depth, from which a point lies off the plane of a wall or floor."""
+"""Voxels, added to three deviations of depth, beyond which a point is not on the plane of a wall or floor."""
 MOST_NAMES = 3
-"""Names that are told of one thing at most,"""
+"""Names kept per object at most,"""
 LEAST_NAME = 0.02
 """and how probable they are at least."""
 FLAT = 0.85
-"""Share of a thing's voxels near its plane from which it is a flat surface."""
+"""Share of an object's voxels near its plane from which it is a flat surface."""
 
 
 @dataclass(frozen=True)
 class LearnedSettings:
-    """What is listed, and where agglomeration stops."""
+    """Thresholds for listing an object and for agglomeration."""
 
     least_confidence: float = 0.6
-    """Things that are less probably one whole are scraps, which are kept but not listed; chosen on left-out worlds,
-    where recall and precision meet near it."""
+    """Segments that are less probably whole have low confidence: kept, not listed. On left-out worlds recall and
+    precision are equal near it."""
     least_confidence_computed: float = 0.4
     """... where depth was computed from pictures; anything from 0.3 to 0.5 does as well on left-out rooms
     (research/discovery 0201)."""
-    least_scrap: float = 0.1
-    """Things that are less probably one whole are not even kept."""
+    least_whole: float = 0.1
+    """Objects that are less probably one whole are not even kept."""
     plane_area_m2: float = 0.25
-    """Smallest flat surface looked for, from which gravity is told and structure is parted."""
+    """Smallest flat surface searched for, to estimate gravity and to separate structure."""
     cut: CutSettings = field(default_factory=CutSettings)
     depth_errors: DepthErrorSettings = field(default_factory=DepthErrorSettings, metadata={"formerly": "doubt"})
     """Of computed depth."""
 
 
 class LearnedDiscoverer(CloudDiscoverer):
-    """Proposes the things of the chunk's fused cloud as masks on an anchor, cut by the trained networks."""
+    """Proposes the objects of the chunk's fused cloud as masks on an anchor, cut by the trained networks."""
 
     def __init__(
         self,
@@ -67,13 +67,13 @@ class LearnedDiscoverer(CloudDiscoverer):
         super().__init__(settings)
         self._learned = learned or LearnedSettings()
         self._weights = {sensed: load_weights(weights, sensed=sensed) for sensed in (True, False)}
-        self._scraps: tuple[Segmentation, Features] | None = None
+        self._low_confidence: tuple[Segmentation, Features] | None = None
 
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
-        """Propose masks on the frame at `position`, best first, with the probability that each is one thing."""
+        """Propose masks on the frame at `position`, best first, with the probability that each is one whole object."""
         found = super().__call__(frames, reconstruction, position)
-        scraps = None if self._scraps is None else self.looked_at(reconstruction, position, *self._scraps)
-        return replace(found, whole=found.score, scraps=scraps)
+        unsure = None if (cut := self._low_confidence) is None else self.propose(reconstruction, position, *cut)
+        return replace(found, whole=found.score, low_confidence=unsure)
 
     def _segment(self, views: ChunkViews) -> tuple[Cloud, Segmentation, Features]:
         settings = self.settings.segment
@@ -87,7 +87,7 @@ class LearnedDiscoverer(CloudDiscoverer):
         up = estimate_up(planes, poses)
         height = float(np.median(poses[:, :3, 3] @ up))
         if not len(cloud.keys):
-            self._scraps = None
+            self._low_confidence = None
             return cloud, Segmentation(np.zeros(0, np.int32), (), up), np.zeros((0, 64), np.float32)
         around = Surroundings(up, views.unit, height, computed)
         surface = chunk_surface(cloud, shown, around)
@@ -99,24 +99,22 @@ class LearnedDiscoverer(CloudDiscoverer):
         parted = _walls_apart(cloud, cut.only(listed), planes)
         names = names_of(weights)
         kept, features = _described(cloud, parted, up, views.unit, names)
-        scraps = cut.only(~listed & (cut.verdicts.whole >= self._learned.least_scrap))
-        self._scraps = _described(cloud, scraps, up, views.unit, names)
+        unsure = cut.only(~listed & (cut.verdicts.whole >= self._learned.least_whole))
+        self._low_confidence = _described(cloud, unsure, up, views.unit, names)
         return cloud, kept, features
 
     def _as_sure_as_depth(
         self, views: ChunkViews, surface: ChunkSurface, cut: CloudCut, planes: Sequence[Plane]
     ) -> CloudCut:
-        """The cut without what errors of computed depth explain."""
+        """The cut without segments that errors of computed depth explain."""
         s, doubt = self._learned.depth_errors, voxel_doubt(views, surface.cloud)
-        cut = without_bends(surface, cut, planes, doubt, s)
+        cut = without_depth_bends(surface, cut, planes, doubt, s)
         return without_slivers(surface.cloud, cut, doubt, s, 0.5 * self._learned.least_confidence_computed)
 
 
 def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudCut:
-    """The cut with structure of several planes (walls round a corner) as one thing for each.
-
-    What lies off all of them (a ledge, a bit of a neighbour) is of none, so that walls stay flat; a thing of which
-    nothing is left is left out.
+    """The cut with structure of several planes (walls round a corner) split into one segment per plane. Voxels off all
+    planes (a ledge, a bit of a neighbour) become unlabelled, so that walls stay flat; empty segments are dropped.
     """
     labels, origin = cut.labels.copy(), list(range(len(cut.verdicts.structure)))
     for number in np.flatnonzero(cut.verdicts.structure > 0.5).tolist():
@@ -134,7 +132,7 @@ def _walls_apart(cloud: Cloud, cut: CloudCut, planes: Sequence[Plane]) -> CloudC
 
 
 def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> list[NDArray[np.float64]]:
-    """Planes of which each holds a tenth of some voxels, none twice. Shape (4,) each."""
+    """Distinct planes that hold a tenth of some voxels each. Shape (4,) each."""
     faces: list[NDArray[np.float64]] = []
     for plane in sorted(planes, key=lambda p: -len(p.members)):
         held = np.intersect1d(plane.members, mine, assume_unique=True)
@@ -147,13 +145,13 @@ def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> li
     return faces
 
 
-def _named(told: ThingVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
-    """The likeliest names of each thing with their probabilities; none for structure.
+def _named(scores: SegmentVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
+    """The likeliest names of each object with their probabilities; none for structure.
 
-    Unsure ones are told, too: what a thing is called is decided when all chunks have spoken.
+    Uncertain ones are kept: the name is decided over all chunks.
     """
     out: list[tuple[tuple[str, float], ...]] = []
-    for row, structure in zip(told.names, told.structure, strict=True):
+    for row, structure in zip(scores.names, scores.structure, strict=True):
         best = np.argsort(-row, kind="stable")[:MOST_NAMES]
         likely = [(names[k], round(float(row[k]), 4)) for k in best if row[k] >= LEAST_NAME]
         out.append(tuple(likely) if structure <= 0.5 else ())
@@ -179,7 +177,7 @@ def _described(
 
 
 def _plane_of(cloud: Cloud, mine: NDArray[np.int64], unit: float) -> NDArray[np.float64] | None:
-    """Plane through the voxels of a flat thing, its normal towards the cameras, else None. Shape (4,)."""
+    """Plane through the voxels of a flat object, its normal towards the cameras, else None. Shape (4,)."""
     if len(mine) < 30:
         return None
     points = cloud.points[mine].astype(np.float64)

@@ -1,4 +1,4 @@
-"""The graph of a cloud's pieces: what each is like, and what lies between neighbours."""
+"""The graph of a cloud's pieces: features of each piece and of each border."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Float = NDArray[np.float32]
 NODE_FEATURES = 26
 EDGE_FEATURES = 24
 REACH_PX = 3
-"""Pixels between the two sides of a border that are looked at in a view; depth is least sure right at it."""
+"""Pixels between the two compared sides of a border in a view; depth is least certain right at it."""
 COMPUTED_REACHES = 2
-"""How many times so far it is looked for the other side of computed depth, which has gaps at outlines."""
+"""Times this distance that the other side is searched in computed depth, which has gaps at outlines."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What features are measured against."""
+    """Frame and units of the features."""
 
     up: NDArray[np.float64]
     """Upward direction, chunk frame. Shape (3,)."""
@@ -40,7 +40,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class ChunkSurface:
-    """A cloud of N voxels with what features are made of, worked out once."""
+    """A cloud of N voxels with the inputs of its features, computed once."""
 
     cloud: Cloud
     views: Sequence[View]
@@ -154,7 +154,7 @@ class _Pieces:
         return np.column_stack([self.size, self.center, *spread])
 
     def features(self) -> NDArray[np.float64]:
-        """What each piece is like by itself. Shape (P, NODE_FEATURES - 2)."""
+        """Features of each piece. Shape (P, NODE_FEATURES - 2)."""
         spread = np.sqrt(np.maximum(np.linalg.eigvalsh(self._cov), 0.0))
         eye = self._around.camera_height / self._around.unit
         wide = np.sqrt(np.maximum(self._cov[:, 0, 0] + self._cov[:, 1, 1], 0.0))
@@ -243,7 +243,7 @@ def _near_codes(cloud: Cloud, labels: NDArray[np.int32], count: int, doublings: 
 def _contact(
     surface: ChunkSurface, labels: NDArray[np.int32], meets: _Touching, codes: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """What the voxels on both sides of each border tell. Shape (E, 10)."""
+    """Features of the voxels on both sides of each border. Shape (E, 10)."""
     cloud, at = surface.cloud, np.searchsorted(codes, meets.code)
     held = cloud.points, cloud.normals, surface.lab, cloud.sigma
     sums = contact_sums(meets.pairs, at, held, np.float32(cloud.voxel), len(codes))
@@ -265,7 +265,7 @@ def _contact(
 
 
 def _between(stats: _Pieces, left: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How two pieces lie to one another. Shape (E, 7)."""
+    """Geometry between two pieces. Shape (E, 7)."""
     way = stats.center[right] - stats.center[left]
     far = np.maximum(np.linalg.norm(way, axis=1), 1e-6)
     n, m = stats.normal[left], stats.normal[right]
@@ -293,7 +293,7 @@ def _contrast(stats: _Pieces, left: NDArray[np.int64], right: NDArray[np.int64])
 def _seen(
     surface: ChunkSurface, labels: NDArray[np.int32], codes: NDArray[np.int64], count: int
 ) -> NDArray[np.float64]:
-    """What views show across each border: how often it is seen, who is before whom, the step of colour. (E, 5)."""
+    """Views of each border: number of observations, depth order, step of colour. (E, 5)."""
     table, sums = np.append(labels, np.int32(-1)), np.zeros((len(codes), 5))
     most = COMPUTED_REACHES if surface.around.computed else 1
     for view, lab, index in zip(surface.views, surface.view_lab, surface.cloud.index, strict=True):

@@ -19,7 +19,7 @@ def way_costs(
     voxel: np.float32,
     weights: tuple[np.float32, np.float32, np.float32],
 ) -> Float:
-    """Length of the way between neighbouring voxels. Shape (M,).
+    """Path length between neighbouring voxels. Shape (M,).
 
     `cloud` is points, normals and colours (N, 3); `weights` those of a bend, of a step of colour and of a rise.
     """
@@ -130,11 +130,11 @@ def seen_across(
     count: int,
     sums: NDArray[np.float64],
 ) -> None:
-    """Add to `sums` (E, 5) what a view shows across each border, between pixels that are `apart` in rows and columns;
-    where the second is of none, up to so many times (the third number) as far.
+    """Add a view's observations of each border to `sums` (E, 5), between pixels that are `apart` in rows and columns;
+    where the second has no label, up to so many times (the third number) as far.
 
-    How often it is seen, who is before whom, and the steps of lightness and of colour. `view` is depth and the least
-    jump of it (h, w), and colours (h, w, 3); `codes` (E,) ascend.
+    Number of observations, depth order, and the steps of lightness and of colour. `view` is depth and the least jump of
+    it (h, w), and colours (h, w, 3); `codes` (E,) ascend.
     """
     depth, limit, lab = view
     for row in range(image.shape[0]):

@@ -1,4 +1,4 @@
-"""How far names given by the classifier of things can be trusted, also in rooms unlike those of its training."""
+"""Calibrated confidence of the classifier's names, also in rooms unlike its training data."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ LEAST, MOST_SURE = 0.018, 1e-3
 
 @dataclass(frozen=True)
 class NameSigns:
-    """Signs of whether the likeliest names of T things are right."""
+    """Signs of whether the likeliest names of T objects are right."""
 
     odds: Float
     """Log odds of the name. Shape (T,)."""
     whole: Float
-    """Probability that the thing is one whole. Shape (T,)."""
+    """Probability that the object is one whole. Shape (T,)."""
     others: float
-    """Mean log odds of the likeliest names of the chunk's things, pulled towards 0 where they are few. It is low
-    where the network does not know the room."""
+    """Mean log odds of the likeliest names of the chunk's objects, pulled towards 0 where they are few. It is low where
+    the network does not know the room."""
 
 
 @dataclass(frozen=True)
 class NameConfidence:
-    """Log odds that the likeliest name of a thing is right: logistic regression on rooms that the networks did not
+    """Log odds that the likeliest name of an object is right: logistic regression on rooms that the networks did not
     learn from, none of them furnished by others (research/names 0144).
     """
 
@@ -49,9 +49,8 @@ def name_signs(names: Float, whole: Float, structure: Float) -> NameSigns:
 
 
 def with_confidence(names: Float, right: Float) -> Float:
-    """Return names (T, C) of which the likeliest has the probability `right` (T,).
-
-    Where that is less than before, what is taken off goes to none of the names.
+    """Return names (T, C) with the likeliest at probability `right` (T,). Probability that it loses goes to no other
+    name.
     """
     rows, best = np.arange(len(names)), names.argmax(axis=1)
     most = np.clip(names[rows, best], 1e-9, 1.0 - 1e-9)

@@ -1,4 +1,4 @@
-"""A small message-passing network over a graph of pieces, in NumPy: what belongs together, and what it is."""
+"""A small message-passing network over a graph of pieces, in NumPy: affinities and classes."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Weights = Mapping[str, Float]
 
 @dataclass(frozen=True)
 class Classification:
-    """What a network says of a graph of P pieces and E borders."""
+    """A network's outputs for a graph of P pieces and E borders."""
 
     affinity: Float
-    """Log odds that both sides of a border are one thing. Shape (E,)."""
+    """Log odds that both sides of a border are one object. Shape (E,)."""
     structure: Float
-    """Log odds that a piece is of what bounds the room. Shape (P,)."""
+    """Log odds that a piece bounds the room. Shape (P,)."""
     names: Float
     """Log probabilities of the names. Shape (P, C)."""
     hidden: Float
-    """What the network makes of each piece. Shape (P, H)."""
+    """Hidden state of each piece. Shape (P, H)."""
 
 
 def classify(weights: Weights, prefix: str, graph: PieceGraph) -> Classification:
@@ -42,8 +42,8 @@ def classify(weights: Weights, prefix: str, graph: PieceGraph) -> Classification
         layer = f"layers.{k}"
         m = w.linear(f"{layer}.here", h)[target] + w.linear(f"{layer}.there", h)[source] + w.linear(f"{layer}.way", e)
         m = np.maximum(m, 0.0)
-        told = np.concatenate([h, sums.mean(m), sums.most(m)], axis=1)
-        h = w.norm(f"{layer}.norm", h + w.two(f"{layer}.update", told))
+        scores = np.concatenate([h, sums.mean(m), sums.most(m)], axis=1)
+        h = w.norm(f"{layer}.norm", h + w.two(f"{layer}.update", scores))
         e = w.norm(f"{layer}.edge_norm", e + w.linear(f"{layer}.edge_update", m))
     half = len(graph.left)
     a, b = h[graph.left], h[graph.right]
@@ -56,7 +56,7 @@ def classify(weights: Weights, prefix: str, graph: PieceGraph) -> Classification
 
 
 def two_layers(weights: Weights, name: str, x: Float) -> Float:
-    """Return what a hidden layer and a linear one after it make of x. Shape (N, D) -> (N, O)."""
+    """Apply a hidden layer and a linear one to x. Shape (N, D) -> (N, O)."""
     h = np.maximum(x @ weights[f"{name}.0.weight"].T + weights[f"{name}.0.bias"], 0.0)
     return np.asarray(h @ weights[f"{name}.2.weight"].T + weights[f"{name}.2.bias"], np.float32)
 
@@ -83,7 +83,7 @@ class _Layers:
 
 
 class _Sums:
-    """Means and maxima over what arrives at each piece."""
+    """Means and maxima of the messages to each piece."""
 
     def __init__(self, target: NDArray[np.int64], count: int) -> None:
         self._order = np.argsort(target, kind="stable")

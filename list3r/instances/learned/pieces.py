@@ -1,4 +1,4 @@
-"""The pieces that the first network judges: superpoints, those of one flat calm surface already joined."""
+"""The pieces that the first network judges: superpoints, joined over flat plain surfaces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from list3r.instances.learned.superpoints import SuperpointSettings, cut_superpo
 
 @dataclass(frozen=True)
 class CalmSettings:
-    """What counts as one flat surface without a border. Each is where the doubt reaches one."""
+    """Limits of one flat surface without a border: each is where its doubt reaches one."""
 
     bend: float = 0.06
     """1 - cosine between the normals of two superpoints (20 degrees)."""
@@ -23,7 +23,7 @@ class CalmSettings:
     color: float = 9.0
     """Difference of their colours, Lab with lightness halved."""
     least_contact: float = 1.3
-    """Logarithm of the number of voxels that touch; those that touch less are not joined here."""
+    """Logarithm of the number of voxels that touch; pieces with less contact are not joined here."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,10 @@ class Pieces:
 
 
 def cut_pieces(surface: ChunkSurface, settings: PieceSettings | None = None) -> Pieces:
-    """Cut a cloud into pieces: superpoints, and what is flat, even and of one colour as one.
-
-    Large plain surfaces so become single pieces with long borders: a quarter of the pieces is left, and what a network
-    is told at one end of a wall it knows at the other. On 10 chunks of training 6,120 superpoints became 1,600 a chunk;
-    99.9 % of the voxels lie in a piece of their own thing, and no thing was lost.
+    """Cut a cloud into pieces: superpoints, joined where flat, even and of one colour. Large plain surfaces become
+    single pieces with long borders: a quarter of the pieces remains, and messages cross a whole wall at once. On 10
+    chunks of training 6,120 superpoints became 1,600 a chunk;
+    99.9 % of the voxels are in a piece of their own object, and no object was lost.
     """
     s = settings or PieceSettings()
     fine = cut_superpoints(surface, s.superpoints)

@@ -1,4 +1,4 @@
-"""The chunk's cloud cut into small pieces that no border of a thing runs through."""
+"""The chunk's cloud cut into small pieces that no border of an object runs through."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from list3r.instances.learned.kernels import way_costs
 
 @dataclass(frozen=True)
 class SuperpointSettings:
-    """How fine the pieces are, and what they keep to."""
+    """Size of the pieces, and the borders they respect."""
 
     seed_m: float = 0.06
     """Spacing of the seeds from which pieces grow."""
@@ -55,7 +55,7 @@ def cut_superpoints(surface: ChunkSurface, settings: SuperpointSettings | None =
     known = source >= 0
     number = np.full(size, -1, np.int64)
     number[known] = np.searchsorted(seeds, source[known])
-    labels, count = _without_scraps(number, s.least)
+    labels, count = _without_fragments(number, s.least)
     return Superpoints(labels, count)
 
 
@@ -84,7 +84,7 @@ def _seeds(
     return np.sort(order[first[count >= 4]])
 
 
-def _without_scraps(number: NDArray[np.int64], least: int) -> tuple[NDArray[np.int32], int]:
+def _without_fragments(number: NDArray[np.int64], least: int) -> tuple[NDArray[np.int32], int]:
     """Pieces renumbered without those of fewer voxels than `least`, and how many are left."""
     size = np.bincount(number[number >= 0], minlength=1)
     keep = size >= least

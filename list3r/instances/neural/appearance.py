@@ -1,8 +1,8 @@
-"""Features of DINOv2 or DINOv3: of things, patch tokens pooled inside each mask; of frames, the class token and all
+"""Features of DINOv2 or DINOv3: of objects, patch tokens pooled inside each mask; of frames, the class token and all
 patch tokens, by which places are found again.
 
 A frame's patch tokens are pooled by their generalised mean of power 3 (GeM: Radenovic, Tolias, Chum, "Fine-tuning CNN
-image retrieval with no human annotation", 2019), so that few strong tokens tell more than many weak ones.
+image retrieval with no human annotation", 2019), so that few strong tokens outweigh many weak ones.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Appearance:
         return states[0].cpu().numpy(), patches.cpu().numpy()
 
     def whole(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Unit descriptor of a whole picture (H, W, 3): its class token beside its pooled patch tokens. Shape (2 D,).
+        """Unit descriptor of a whole picture (H, W, 3): its class token and its pooled patch tokens. Shape (2 D,).
 
         The cosine of two pictures is the mean of both parts' cosines.
         """

@@ -16,7 +16,7 @@ from list3r.instances.settings import CandidateSettings
 
 @dataclass(frozen=True)
 class SoftMasks:
-    """What a network says of one picture, N masks."""
+    """A network's output for one picture, N masks."""
 
     probability: NDArray[np.float32]
     """In [0, 1] at each pixel. Shape (N, H, W)."""
@@ -25,7 +25,7 @@ class SoftMasks:
     features: NDArray[np.float32]
     """Shape (N, D), any length."""
     names: tuple[str, ...] = ()
-    """What each shows, empty where the network does not say."""
+    """Class name of each mask, empty where the network has none."""
 
 
 def choose_candidates(
@@ -53,21 +53,21 @@ def choose_candidates(
     structure = np.array([bool(masks.names) and bounds_the_room(masks.names[n]) for n in kept], bool)
     plane = np.full((len(kept), 4), np.nan)
     for k in range(len(kept)):
-        if structure[k] or not masks.names:  # what has the name of a thing is not taken for floor or wall
+        if structure[k] or not masks.names:  # a mask with the name of an object is no floor or wall
             plane[k] = plane_of_mask(labels == k + 1, views, position, chosen.flat_rms)
     names = tuple(masks.names[n] for n in kept) if masks.names else None
     return Proposals(position, labels, score[kept], features, plane, structure=structure, names=names)
 
 
 BORDER = 2
-"""Pixels of the working size along the border of a mask that may belong to what is behind the thing."""
+"""Pixels of the working size along the border of a mask that may belong to the background."""
 
 
 def without_spill(labels: NDArray[np.int32], view: View, stride: int) -> NDArray[np.int32]:
-    """Labels (H, W) without pixels near a mask's border whose depth is not that of the mask's inside.
+    """Labels (H, W) without pixels near a mask's border that differ in depth from its inside.
 
-    A picture's edge and the depth's edge never lie on the same pixel; without this every thing would own a rim of the
-    wall behind it. Masks too small to have an inside stay as they are.
+    Edges of colour and of depth are never on the same pixel; otherwise every object would own a rim of the wall behind.
+    Masks too small to have an inside stay as they are.
     """
     small = np.ascontiguousarray(labels[::stride, ::stride])
     keep = np.ones(small.shape, bool)

@@ -1,9 +1,9 @@
-"""Discovery `precomputed`: masks that some model wrote beside its geometry (docs/precomputed.md).
+"""Discovery `precomputed`: masks that some model wrote next to its geometry (docs/precomputed.md).
 
-Where it wrote no features with them, a thing is known again by its colours in the anchor's picture.
+Where it wrote no features with them, an object is known again by its colours in the anchor's picture.
 
-A number in a file's masks is one thing throughout that file, so candidates of several anchors need no guessing. Files
-that hold only some of a chunk's frames number their things on their own.
+A number in a file's masks is one object throughout that file, so candidates of several anchors need no guessing. Files
+that hold only some of a chunk's frames number their objects on their own.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.precomputed import open_folder
 from list3r.reconstruction.precomputed_files import Piece, read_piece
 
-MOST_THINGS = 1_000_000
-"""Things of one file; numbers of different files are kept apart by this."""
+MOST_OBJECTS = 1_000_000
+"""Objects of one file; numbers of different files are kept apart by this."""
 
 
 class PrecomputedMasks:
@@ -80,24 +80,24 @@ class PrecomputedMasks:
             score=np.ones(len(numbers), np.float32),
             features=np.divide(features, length, out=np.zeros_like(features), where=length > 0),
             plane=np.full((len(numbers), 4), np.nan),
-            identity=numbers + MOST_THINGS * file,
+            identity=numbers + MOST_OBJECTS * file,
         )
 
     def _checked(self, k: int) -> NDArray[np.float32] | None:
-        """Features of a file, one row for each thing of its masks, None where it has none."""
+        """Features of a file, one row for each object of its masks, None where it has none."""
         path = self._folder.files[k]
         piece = _piece(path)
         if piece.masks is None:
             raise OptionError(f"{path} has no masks, which --discovery precomputed needs")
         least, most = int(piece.masks.min(initial=0)), int(piece.masks.max(initial=0))
-        rows = MOST_THINGS - 1 if piece.features is None else len(piece.features)
-        if least < 0 or most > min(rows, MOST_THINGS - 1):
-            raise OptionError(f"{path}: masks hold things {least} to {most}; features has {rows} rows")
+        rows = MOST_OBJECTS - 1 if piece.features is None else len(piece.features)
+        if least < 0 or most > min(rows, MOST_OBJECTS - 1):
+            raise OptionError(f"{path}: masks hold objects {least} to {most}; features has {rows} rows")
         return None if piece.features is None else np.nan_to_num(piece.features)
 
 
 def _colors(color: NDArray[np.uint8], labels: NDArray[np.int32], count: int) -> NDArray[np.float32]:
-    """Features of the things 1 to `count` of a picture by their colours. Shape (count, D)."""
+    """Features of the objects 1 to `count` of a picture by their colours. Shape (count, D)."""
     rows = [color_feature(color[labels == n + 1]) for n in range(count)]
     return np.stack(rows) if rows else np.zeros((0, COLOR_PART), np.float32)
 

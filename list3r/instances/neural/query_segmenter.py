@@ -1,7 +1,7 @@
 """Discovery by a query-based segmenter of `transformers` (EoMT or Mask2Former): mask, query embedding and name.
 
-The manner of the paper's EntitySAM (A.1): each learned query stands for one thing of the picture, and its embedding
-is the object feature z. Instances of things and regions of stuff come from one panoptic checkpoint.
+The manner of the paper's EntitySAM (A.1): each learned query represents one object of the picture, and its embedding is
+the object feature z. Instances of objects and regions of stuff come from one panoptic checkpoint.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ class QuerySegmenter:
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Candidates on the frame at `position`."""
         views = chunk_views(frames, reconstruction, self._settings)
-        return choose_candidates(self.look(frames[position].color), views, position, self._settings.candidates)
+        return choose_candidates(self.segment(frames[position].color), views, position, self._settings.candidates)
 
-    def look(self, color: NDArray[np.uint8]) -> SoftMasks:
-        """Return what the network says of one picture (H, W, 3); queries that show nothing are left out."""
+    def segment(self, color: NDArray[np.uint8]) -> SoftMasks:
+        """Return the network's masks of one picture (H, W, 3), without empty queries."""
         import torch
 
         with torch.inference_mode():

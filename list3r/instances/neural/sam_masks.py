@@ -53,9 +53,9 @@ class SamMasks:
     def __call__(self, frames: Sequence[Frame], reconstruction: Reconstruction, position: int) -> Proposals:
         """Candidates on the frame at `position`."""
         views = chunk_views(frames, reconstruction, self._settings)
-        return choose_candidates(self.look(frames[position].color), views, position, self._sam.candidates)
+        return choose_candidates(self.segment(frames[position].color), views, position, self._sam.candidates)
 
-    def look(self, color: NDArray[np.uint8]) -> SoftMasks:
+    def segment(self, color: NDArray[np.uint8]) -> SoftMasks:
         """All good masks of one picture (H, W, 3)."""
         import torch
 

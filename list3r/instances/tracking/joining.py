@@ -1,4 +1,4 @@
-"""Candidates of several anchors that are views of one thing."""
+"""Candidates of several anchors that are views of one object."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.fusion import View, intrinsics_of
-from list3r.instances.geometric.kernels import carry_labels
+from list3r.instances.geometric.kernels import propagate_labels
 from list3r.instances.geometric.views import ChunkViews
 
 MIN_OVERLAP = 0.4
-"""Overlap over union, of what both anchors see, from which two candidates are taken for one thing."""
+"""IoU, over the surface that both anchors see, from which two candidates are one object."""
 
 
 def join_candidates(views: ChunkViews, proposals: Sequence[Proposals]) -> list[NDArray[np.int64]]:
@@ -94,7 +94,7 @@ def warp_labels(
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Labels of the source view looked up from a depth image of another camera. Shape (h, w) each."""
     camera = intrinsics_of(views.camera)
-    return carry_labels(
+    return propagate_labels(
         np.ascontiguousarray(depth),
         camera,
         np.ascontiguousarray(T_source_cam, np.float32),

@@ -1,4 +1,4 @@
-"""Instances of what moves of its own: masks, a track of places, and surface points where it was seen last."""
+"""Moving instances: masks, a track of places, and surface points where they were seen last."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def with_movers(
     reconstruction: Reconstruction,
     settings: MoverInstanceSettings | None = None,
 ) -> LocalLibrary:
-    """Return the library with an instance more for everything that moves; `dynamic`, with its `motion`.
+    """Return the library with one more instance for each moving object; `dynamic`, with its `motion`.
 
-    Their points come from the frames' own depth, for the reconstruction holds what stays alone.
+    Their points come from the frames' own depth, since the reconstruction holds static surfaces only.
     """
     s = settings or MoverInstanceSettings()
     if reconstruction.movers is None:
@@ -104,16 +104,16 @@ def _support(
     small: SmallFrames,
     s: MoverInstanceSettings,
 ) -> Support:
-    """Points where it was last, from the last good view and those beside it."""
+    """Points where it was last, from the last good view and its neighbours."""
     size = np.array([b.mask.sum() for b in blobs], float)
     good = (size >= s.whole * size.max()) & ~np.array([b.cut.any() for b in blobs])
     if not good.any():
         good = size >= s.whole * size.max()
     last = int(np.flatnonzero(good)[-1])
     resting = np.flatnonzero(np.linalg.norm(places - places[-1], axis=1) < s.rest_m)
-    chosen = [n for n in range(last - s.beside, last + s.beside + 1) if 0 <= n < len(blobs)]
-    if len(resting) > 2 * s.beside and good[resting].any():
-        chosen = resting[good[resting]][:: max(1, len(resting) // (2 * s.beside + 1))].tolist()
+    chosen = [n for n in range(last - s.neighbours, last + s.neighbours + 1) if 0 <= n < len(blobs)]
+    if len(resting) > 2 * s.neighbours and good[resting].any():
+        chosen = resting[good[resting]][:: max(1, len(resting) // (2 * s.neighbours + 1))].tolist()
         last = chosen[-1]
     stride = max(1, round(reconstruction.camera.width / 320))
     points, rgb, confidence = [], [], []
@@ -148,7 +148,7 @@ def _points(
 
 
 def _apart(movers: Sequence[LocalInstance], least: int) -> NDArray[np.int32]:
-    """Pairs that were seen side by side: two things. Shape (P, 2)."""
+    """Pairs that were seen side by side: two objects. Shape (P, 2)."""
     pairs = [
         (a.local_id, b.local_id)
         for n, a in enumerate(movers)

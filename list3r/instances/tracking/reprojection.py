@@ -25,12 +25,12 @@ from list3r.reconstruction.base import Reconstruction
 Ints = NDArray[np.int64]
 
 SAMPLES = 150
-"""Support points of an instance that are looked for in every frame."""
+"""Support points of an instance that are projected into every frame."""
 
 
 @dataclass
 class GrowingTrack:
-    """What grows frame by frame for one instance."""
+    """The growing track of one instance."""
 
     frames: list[int] = field(default_factory=list)
     boxes: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -82,7 +82,7 @@ class ReprojectionTracker:
 
 @dataclass(frozen=True)
 class LabelledChunk:
-    """Candidates that were given to instances, and the instances' supports: what any tracker ends in."""
+    """Candidates that were given to instances, and the instances' supports: the last step of every tracker."""
 
     views: ChunkViews
     proposals: Sequence[Proposals]
@@ -158,7 +158,7 @@ def frame_labels(
     positions: NDArray[np.int64],
     position: int,
 ) -> NDArray[np.int32]:
-    """Instance + 1 of each pixel of a frame, carried over from the nearest anchors that see it. Shape (h, w)."""
+    """Instance + 1 of each pixel of a frame, propagated from the nearest anchors that see it. Shape (h, w)."""
     if position in positions:
         return _tidy(images[int(np.flatnonzero(positions == position)[0])], views.small_depth(position))
     depth = views.small_depth(position)
@@ -201,7 +201,7 @@ def encode_labels(
 def _codes(
     starts: Ints, stops: Ints, bounds: Ints, height: int, width: int
 ) -> tuple[NDArray[np.uint32], Ints, NDArray[np.float64]]:
-    """Run-length codes of masks, one behind the other, where each ends, and area, box and centroid of each (M, 7).
+    """Concatenated run-length codes of masks, where each ends, and area, box and centroid of each (M, 7).
 
     `starts` and `stops` (N,) are runs of pixels, those of mask k from `bounds[k]` to `bounds[k + 1]`.
     """
@@ -248,7 +248,7 @@ def _look_for(
     owner: NDArray[np.int64],
     count: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """For each instance: share of its samples that are seen, and share of these that lie on its mask."""
+    """For each instance: share of its samples that are seen, and share of these that are on its mask."""
     T_cam_chunk = np.linalg.inv(views.pose(position))
     p = samples @ T_cam_chunk[:3, :3].T.astype(np.float32) + T_cam_chunk[:3, 3].astype(np.float32)
     z = np.maximum(p[:, 2], 1e-6)
@@ -284,7 +284,7 @@ def _surface(
 def _names(
     proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
 ) -> tuple[tuple[str, float], ...]:
-    """Return what an instance's candidates were called, with their scores, in order of the anchors."""
+    """Return the names of an instance's candidates, with their scores, in order of the anchors."""
     return tuple(
         (p.names[n], float(p.score[n]))
         for p, owner in zip(proposals, joined, strict=True)
@@ -294,7 +294,7 @@ def _names(
 
 
 def _whole(proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int) -> float:
-    """Return the mean probability that an instance's candidates are one thing; 1 where nobody tells it."""
+    """Return the mean probability that an instance's candidates are one object; 1 where it is unknown."""
     said = [p.whole[owner == number] for p, owner in zip(proposals, joined, strict=True) if p.whole is not None]
     every = np.concatenate(said) if said else np.zeros(0, np.float32)
     return float(every.mean()) if len(every) else 1.0
@@ -303,7 +303,7 @@ def _whole(proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], 
 def _named(
     proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
 ) -> tuple[tuple[str, float], ...]:
-    """Return the names that an instance may have: the mean of what is said of its candidates on all anchors."""
+    """Return the names that an instance may have: the mean over its candidates on all anchors."""
     said = [
         p.named[n]
         for p, owner in zip(proposals, joined, strict=True)

@@ -1,8 +1,8 @@
 """Masks followed through a chunk by a video tracker: SAM 2, SAM 3 or EdgeTAM of `transformers` (paper A.1).
 
-One bounded state for each sweep: the memories that the network no longer reads are dropped, and when more things are
-followed than allowed a new state begins with those that are in view, prompted again by their own masks. A thing first
-found on a later anchor is followed backwards in a second sweep. Ids are handed over by the overlap of masks on anchors.
+One bounded state for each sweep: the memories that the network no longer reads are dropped, and when too many objects
+are followed a new state begins with the visible ones, prompted by their own masks. An object first found on a later
+anchor is followed backwards in a second sweep. Ids are handed over by the overlap of masks on anchors.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SESSIONS = {
 
 
 class VideoTracker:
-    """Tracker: candidates of the anchors prompt a network that carries masks from frame to frame."""
+    """Tracker: candidates of the anchors prompt a network that propagates masks from frame to frame."""
 
     def __init__(
         self,
@@ -71,33 +71,33 @@ class VideoTracker:
         """Follow all candidates through the posed frames, forwards and backwards; keep the stable tracks."""
         views = chunk_views(frames, reconstruction, self._settings)
         order = np.flatnonzero(reconstruction.posed).tolist()
-        things = _Things(proposals, views, self._tracker)
-        for position, masks in self._sweep(frames, order, things, forwards=True):
-            things.keep(position, masks)
-        if things.late:
-            for position, masks in self._sweep(frames, order[::-1], things, forwards=False):
-                things.keep(position, masks)
-        images = [things.labels(p.position) for p in proposals]
-        supports = collect_supports(views, proposals, images, things.count, self._settings.track.support_points)
-        chunk = LabelledChunk(views, proposals, things.joined, supports, self._settings)
-        return chunk.library(things.labels, feature_space)
+        tracked = _Objects(proposals, views, self._tracker)
+        for position, masks in self._sweep(frames, order, tracked, forwards=True):
+            tracked.keep(position, masks)
+        if tracked.late:
+            for position, masks in self._sweep(frames, order[::-1], tracked, forwards=False):
+                tracked.keep(position, masks)
+        images = [tracked.labels(p.position) for p in proposals]
+        supports = collect_supports(views, proposals, images, tracked.count, self._settings.track.support_points)
+        chunk = LabelledChunk(views, proposals, tracked.joined, supports, self._settings)
+        return chunk.library(tracked.labels, feature_space)
 
     def _sweep(
-        self, frames: Sequence[Frame], order: Sequence[int], things: _Things, *, forwards: bool
+        self, frames: Sequence[Frame], order: Sequence[int], tracked: _Objects, *, forwards: bool
     ) -> Iterator[tuple[int, dict[int, NDArray[np.float32]]]]:
-        """Logits (h, w) of every followed thing at working size, frame by frame in the given order."""
+        """Logits (h, w) of every followed object at working size, frame by frame in the given order."""
         import torch
 
         state = _State(self._new_session(frames), self._network)
         with torch.inference_mode():
             for position in order:
                 picture = network_input(frames[position].color, self._shape, self._device, self._network.dtype)
-                found = state.step(picture, position, things.shape, reverse=not forwards)
-                prompts = things.prompts(position, found, forwards=forwards)
+                found = state.step(picture, position, tracked.shape, reverse=not forwards)
+                prompts = tracked.prompts(position, found, forwards=forwards)
                 if prompts:
-                    state, prompts = self._with_room(state, prompts, found, things, frames)
+                    state, prompts = self._with_room(state, prompts, found, tracked, frames)
                     state.prompt(prompts, position, self._shape)
-                    found = state.step(picture, position, things.shape, reverse=not forwards)
+                    found = state.step(picture, position, tracked.shape, reverse=not forwards)
                 state.forget(position)
                 yield position, found
 
@@ -106,14 +106,14 @@ class VideoTracker:
         state: _State,
         prompts: dict[int, NDArray[np.bool_]],
         found: Mapping[int, NDArray[np.float32]],
-        things: _Things,
+        tracked: _Objects,
         frames: Sequence[Frame],
     ) -> tuple[_State, dict[int, NDArray[np.bool_]]]:
         """Return the session that follows the prompts too, and the prompts: a new one where there would be too many."""
         if len(state.objects | prompts.keys()) <= self._tracker.most_live:
             return state, prompts
         live = {**{k: v > 0 for k, v in found.items() if (v > 0).any()}, **prompts}
-        return _State(self._new_session(frames), self._network), things.most_wanted(live)
+        return _State(self._new_session(frames), self._network), tracked.most_wanted(live)
 
     def _new_session(self, frames: Sequence[Frame]) -> Any:
         import transformers
@@ -131,7 +131,7 @@ class VideoTracker:
 
 
 def _even_scores(network: Any) -> None:
-    """Give the score of a prompted and of a followed thing one shape.
+    """Give the score of a prompted and of a followed object one shape.
 
     EdgeTAM of transformers 5.23 returns them with different numbers of axes, and then cannot join them when both kinds
     are in one frame.
@@ -171,7 +171,7 @@ class _State:
         return dict(zip(self._session.obj_ids, logits.cpu().numpy(), strict=True))
 
     def prompt(self, masks: dict[int, NDArray[np.bool_]], position: int, shape: InputShape) -> None:
-        """Tell the network where objects are on a frame by their masks (h, w)."""
+        """Prompt the network with the masks (h, w) of objects on a frame."""
         import torch
         from torch.nn import functional
 
@@ -193,18 +193,18 @@ class _State:
                 del kept[old]
 
 
-class _Things:
-    """What is followed: which candidate belongs to which thing, and where each thing was seen."""
+class _Objects:
+    """The followed objects: their candidates, and the frames that saw them."""
 
     def __init__(self, proposals: Sequence[Proposals], views: ChunkViews, settings: VideoTrackerSettings) -> None:
         self._anchors = {p.position: n for n, p in enumerate(proposals)}
         self._proposals, self._views, self._settings = proposals, views, settings
         self.joined = [np.full(len(p.score), -1, np.int64) for p in proposals]
-        """Thing of each candidate of each anchor, -1 for none."""
+        """Object of each candidate of each anchor, -1 for none."""
         self.count = 0
         self.shape = (views.camera.height, views.camera.width)
         self.late: dict[int, int] = {}
-        """First anchor's position of things that were not found on the first anchor."""
+        """First anchor's position of objects that were not found on the first anchor."""
         self._best = {
             int(p): np.zeros(self.shape, np.float32) for p in np.flatnonzero(views.reconstruction.posed).tolist()
         }
@@ -214,7 +214,7 @@ class _Things:
     def prompts(
         self, position: int, found: dict[int, NDArray[np.float32]], *, forwards: bool
     ) -> dict[int, NDArray[np.bool_]]:
-        """Things that begin on a frame, with their masks (h, w): new ones forwards, the late ones backwards."""
+        """Objects that begin on a frame, with their masks (h, w): new ones forwards, the late ones backwards."""
         if position not in self._anchors:
             return {}
         if not forwards:
@@ -222,7 +222,7 @@ class _Things:
         return self._take(position, found)
 
     def _take(self, position: int, found: dict[int, NDArray[np.float32]]) -> dict[int, NDArray[np.bool_]]:
-        """Give each candidate of an anchor to the thing whose mask it overlaps, or make it a new thing."""
+        """Give each candidate of an anchor to the object whose mask it overlaps, or make it a new object."""
         number = self._anchors[position]
         labels = self._proposals[number].labels[:: self._views.stride, :: self._views.stride]
         followed = {k: v > 0 for k, v in found.items()}
@@ -247,12 +247,12 @@ class _Things:
         return new
 
     def most_wanted(self, live: dict[int, NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:
-        """Return the largest things in view, as many as may be followed."""
+        """Return the largest objects in view, as many as may be followed."""
         order = sorted(live, key=lambda k: (-int(live[k].sum()), k))
         return {k: live[k] for k in sorted(order[: self._settings.most_live])}
 
     def keep(self, position: int, masks: dict[int, NDArray[np.float32]]) -> None:
-        """Give every pixel of a frame to the thing that is surest of it."""
+        """Give every pixel of a frame to the object that is surest of it."""
         best, label = self._best[position], self._label[position]
         for number, logits in masks.items():
             wins = logits > best
@@ -260,5 +260,5 @@ class _Things:
             best[wins] = logits[wins]
 
     def labels(self, position: int) -> NDArray[np.int32]:
-        """Thing + 1 of each pixel of a frame at working size (h, w), 0 for none."""
+        """Object + 1 of each pixel of a frame at working size (h, w), 0 for none."""
         return self._label[position]

@@ -24,7 +24,7 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
-from list3r.instances.registry import make_discoverer, make_frame_look, make_tracker
+from list3r.instances.registry import make_discoverer, make_frame_descriptor, make_tracker
 from list3r.memory.errors import BaselineError, SourceError, TrackingError
 from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
@@ -371,7 +371,7 @@ def _frame_look(settings: BuildSettings) -> FrameDescriptor | None:
     if settings.frame_look == "local":
         return None
     folders = tuple((name, str(locate(weights))) for name, weights in settings.instance_weights)
-    return make_frame_look(settings.features, folders, settings.device)
+    return make_frame_descriptor(settings.features, folders, settings.device)
 
 
 @lru_cache(maxsize=2)

@@ -1,4 +1,4 @@
-"""All solids of a scene, some of which move, and where they can show in a picture."""
+"""All solids of a scene, fixed and moving, and where they can appear in a picture."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.simulation.worlds.things import SimulatedThing, stack_solids
+from list3r.simulation.worlds.objects import SimulatedObject, stack_solids
 
 Array = NDArray[np.float64]
 
@@ -17,17 +17,17 @@ _EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b) in (1, 
 
 
 class SolidScene:
-    """The solids of things that stand still and of things that are put elsewhere from frame to frame."""
+    """The solids of objects that are still and of objects that are put elsewhere from frame to frame."""
 
-    def __init__(self, things: Sequence[SimulatedThing], moving: Sequence[SimulatedThing] = ()) -> None:
-        self.solids = stack_solids((*things, *moving))
+    def __init__(self, objects: Sequence[SimulatedObject], moving: Sequence[SimulatedObject] = ()) -> None:
+        self.solids = stack_solids((*objects, *moving))
         self.corners = self.solids.corners()
         """World, metres. Shape (N, 8, 3)."""
-        self._own = {t.id: (np.flatnonzero(self.solids.thing == t.id), stack_solids([t])) for t in moving}
+        self._own = {t.id: (np.flatnonzero(self.solids.object_id == t.id), stack_solids([t])) for t in moving}
 
-    def place(self, thing_id: int, T_world_object: Array) -> None:
-        """Put one of the moving things somewhere, upright; it is made at the origin. `T_world_object` (4, 4)."""
-        rows, home = self._own[thing_id]
+    def place(self, object_id: int, T_world_object: Array) -> None:
+        """Put one of the moving objects somewhere, upright; it is made at the origin. `T_world_object` (4, 4)."""
+        rows, home = self._own[object_id]
         rotation, position = T_world_object[:3, :3], T_world_object[:3, 3]
         self.solids.center[rows] = home.center @ rotation.T + position
         self.solids.yaw[rows] = home.yaw + np.arctan2(rotation[1, 0], rotation[0, 0])

@@ -1,4 +1,4 @@
-"""Ray casting of a world: colour, depth and ids of what each pixel shows."""
+"""Ray casting of a world: colour, depth and object id of each pixel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.simulation.rendering.projection import NEAR_M, SolidScene, screen_rectangles
 from list3r.simulation.rendering.shading import ContactShadows, Lighting, TextureAtlas, illumination, surface
-from list3r.simulation.worlds.things import BOX, CYLINDER, SimulatedThing, stack_solids
+from list3r.simulation.worlds.objects import BOX, CYLINDER, SimulatedObject, stack_solids
 from list3r.simulation.worlds.world import SimulatedWorld
 
 Array = NDArray[np.float64]
@@ -23,14 +23,14 @@ _SUBPIXELS = np.array([[-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.12
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """What a perfect camera sees."""
+    """The image of a perfect camera."""
 
     color: Floats
     """RGB in [0, 255]. Shape (H, W, 3)."""
     depth: Floats
     """Along the camera's z, metres, 0 where nothing is hit. Shape (H, W)."""
     ids: NDArray[np.int32]
-    """Id of the thing, 0 for nothing. Shape (H, W)."""
+    """Id of the object, 0 for nothing. Shape (H, W)."""
     incidence: Floats
     """Cosine between the ray and the surface's normal, in [0, 1]. Shape (H, W)."""
 
@@ -38,22 +38,22 @@ class RenderedFrame:
 class Renderer:
     """Draws a world with one camera. Solids are culled by the rectangle of their corners and drawn near to far.
 
-    Things in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
+    Objects in `moving` are put in their places through `scene` before a frame is rendered; they cast no shadow.
     """
 
     def __init__(
         self,
         world: SimulatedWorld,
         camera: Camera,
-        moving: Sequence[SimulatedThing] = (),
+        moving: Sequence[SimulatedObject] = (),
         lighting: Lighting | None = None,
     ) -> None:
         self._world, self._lighting = world, lighting or Lighting()
         self._camera = camera
-        self.scene = SolidScene(world.things, moving)
+        self.scene = SolidScene(world.objects, moving)
         self._solids = self.scene.solids
         self._atlas = TextureAtlas(self._solids)
-        self._shadows = ContactShadows(world, stack_solids(world.things))
+        self._shadows = ContactShadows(world, stack_solids(world.objects))
         self._x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
         self._y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
 
@@ -69,7 +69,7 @@ class Renderer:
         color, ids = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.int32)
         incidence = np.zeros(shape, np.float32)
         color.reshape(-1, 3)[hit] = shaded
-        ids.ravel()[hit], incidence.ravel()[hit] = self._solids.thing[seen], cosine
+        ids.ravel()[hit], incidence.ravel()[hit] = self._solids.object_id[seen], cosine
         self._smooth_edges(T_world_cam, solid, rects[1], color)
         return RenderedFrame(color, np.where(solid >= 0, depth, 0).astype(np.float32), ids, incidence)
 

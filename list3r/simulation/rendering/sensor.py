@@ -1,4 +1,4 @@
-"""What a real RGB-D camera makes of a perfect picture."""
+"""A real RGB-D camera's errors, added to a perfect picture."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class SensorSettings:
     edge_step: float = 0.03
     """Relative jump between neighbours that counts as an edge."""
     edge_dropout: float = 0.35
-    """Share of readings lost beside an edge."""
+    """Share of readings lost next to an edge."""
     dropout: float = 0.002
     """Share of readings lost anywhere."""
     optics_px: float = 0.5
@@ -51,7 +51,7 @@ class SensorSettings:
 
 @dataclass(frozen=True)
 class SensedFrame:
-    """What the camera hands out."""
+    """The camera's output."""
 
     color: NDArray[np.uint8]
     """RGB. Shape (H, W, 3)."""
@@ -103,7 +103,7 @@ def _depth(frame: RenderedFrame, settings: SensorSettings, rng: np.random.Genera
 
 
 def _edges(depth: Floats, step: float) -> NDArray[np.bool_]:
-    """Pixels beside a jump of depth, relative to the nearer side."""
+    """Pixels next to a jump of depth, relative to the nearer side."""
     kernel = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     middle = (near + far) / 2

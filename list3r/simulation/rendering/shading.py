@@ -1,4 +1,4 @@
-"""Light and surfaces: what colour the visible points of a world have."""
+"""Light and surfaces: the colours of the visible points of a world."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.simulation.worlds.layout import Room
 from list3r.simulation.worlds.materials import TEXTURE_PX, bake, mip_levels
-from list3r.simulation.worlds.things import BOX, Solids
+from list3r.simulation.worlds.objects import BOX, Solids
 from list3r.simulation.worlds.world import HEIGHT_M, SimulatedWorld
 
 Floats = NDArray[np.float32]
@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Lighting:
-    """What lights the rooms."""
+    """The lamps of the rooms."""
 
     sky: float = 0.5
     """Light from everywhere, such as by day through windows."""
@@ -49,7 +49,7 @@ class TextureAtlas:
         self._tile_m = np.array([material.tile_m for material in solids.materials], np.float32)
 
     def sample(self, material: NDArray[np.int64], u_m: Floats, v_m: Floats, footprint_m: Floats) -> Floats:
-        """Colour at surface coordinates in metres, bilinear in the level whose texel is the pixel's footprint.
+        """Colour at surface coordinates in metres, bilinear in the mip level that matches the pixel's footprint.
 
         All arguments have shape (N,); the result (N, 3), RGB in [0, 255].
         """
@@ -79,13 +79,13 @@ class TextureAtlas:
 
 
 class ContactShadows:
-    """Soft darkness on floors and table tops under and beside what stands on them or hangs low above them."""
+    """Soft darkness on floors and table tops under and around objects on them or low above them."""
 
     def __init__(self, world: SimulatedWorld, solids: Solids) -> None:
-        supports = {t.support for t in world.things if t.support is not None and t.container is None}
+        supports = {t.support for t in world.objects if t.support is not None and t.container is None}
         tops = {0.0} | {
             round(float(t.box().center[2] + t.box().size[2] / 2), 3)
-            for t in world.things
+            for t in world.objects
             if t.id in supports and t.structure is None
         }
         self._heights = np.array(sorted(tops))
@@ -100,8 +100,8 @@ class ContactShadows:
     def _bake(self, corners: NDArray[np.float64], height: float, shape: tuple[int, ...]) -> Floats:
         dark = np.zeros(shape, np.float32)
         bottom, top = corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)
-        standing = np.flatnonzero((bottom > height - 0.05) & (top > height + 0.015) & (bottom < height + 1.0))
-        for n in standing[np.argsort(-bottom[standing], kind="stable")]:
+        casting = np.flatnonzero((bottom > height - 0.05) & (top > height + 0.015) & (bottom < height + 1.0))
+        for n in casting[np.argsort(-bottom[casting], kind="stable")]:
             ground = (corners[n, ::2, :2] - self._origin) / _CELL_M
             hull = cv2.convexHull(ground.astype(np.float32)).astype(np.int32)
             strength = float(np.exp(-max(bottom[n] - height, 0.0) / 0.5))

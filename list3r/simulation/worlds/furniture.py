@@ -1,9 +1,9 @@
-"""What stands in the rooms: each function makes the parts of one thing, front towards +y, base at z = 0, metres."""
+"""Furniture: each function makes the parts of one object, front towards +y, base at z = 0, metres."""
 
 from __future__ import annotations
 
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import BOX, CYLINDER, SPHERE, Part, Vec3
+from list3r.simulation.worlds.objects import BOX, CYLINDER, SPHERE, Part, Vec3
 
 Parts = tuple[Part, ...]
 
@@ -182,7 +182,7 @@ def lamp(height: float, base: Material, shade: Material) -> Parts:
 
 
 def monitor(width: float, frame: Material, screen: Material) -> Parts:
-    """Return a screen on a stand."""
+    """Return a screen on a foot."""
     h = width * 0.58
     return (
         block((width * 0.45, 0.18, 0.02), (0, 0, 0.01), frame),

@@ -1,4 +1,4 @@
-"""Distances between things of a simulated world, from their true shapes."""
+"""Distances between objects of a simulated world, from their true shapes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.simulation.worlds.things import BOX, SPHERE, Part, SimulatedThing
+from list3r.simulation.worlds.objects import BOX, SPHERE, Part, SimulatedObject
 
 Array = NDArray[np.float64]
 
 _SLICES = 33
-"""Discs that stand for a sphere: they lie within a hundredth of its radius of it."""
+"""Discs that represent a sphere: they are within a hundredth of its radius of it."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class _Slabs:
     """World z, metres. Shape (N,) each."""
 
 
-def surface_gap(a: SimulatedThing, b: SimulatedThing) -> float:
-    """Distance between the surfaces of two things, metres, 0 where they touch or reach into each other.
+def surface_gap(a: SimulatedObject, b: SimulatedObject) -> float:
+    """Distance between the surfaces of two objects, metres, 0 where they touch or reach into each other.
 
     Exact for boxes and cylinders, to a few tenths of a millimetre for spheres; open vessels count as full.
     """
@@ -39,16 +39,16 @@ def surface_gap(a: SimulatedThing, b: SimulatedThing) -> float:
     return float(np.hypot(np.maximum(above, 0.0), np.maximum(aside, 0.0)).min())
 
 
-def _slabs(thing: SimulatedThing) -> _Slabs:
-    rows = [row for part in thing.parts for row in _rows(part)]
-    rotation, place = thing.rotation()[:2, :2], np.array(thing.position)
+def _slabs(obj: SimulatedObject) -> _Slabs:
+    rows = [row for part in obj.parts for row in _rows(part)]
+    rotation, place = obj.rotation()[:2, :2], np.array(obj.position)
     corners = np.array([r[0] for r in rows]) @ rotation.T + place[:2]
     radius, low, high = (np.array([r[k] for r in rows], dtype=np.float64) for k in (1, 2, 3))
     return _Slabs(corners, radius, low + place[2], high + place[2])
 
 
 def _rows(part: Part) -> list[tuple[Array, float, float, float]]:
-    """(corners (4, 2), radius, low, high) of the slabs of a part, in the frame of its thing."""
+    """(corners (4, 2), radius, low, high) of the slabs of a part, in the frame of its object."""
     x, y, z = part.center
     hx, hy, hz = part.half
     if part.kind == BOX:

@@ -1,4 +1,4 @@
-"""Where things stand: two furnished rooms in their own coordinates, with seeded sizes, colours and small things."""
+"""Where objects are: two furnished rooms in their own coordinates, with seeded sizes, colours and small objects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.materials import Material, Rgb
-from list3r.simulation.worlds.things import SimulatedThing
+from list3r.simulation.worlds.objects import SimulatedObject
 
 WOODS: tuple[tuple[Rgb, Rgb], ...] = (
     ((112, 74, 44), (158, 110, 68)),
@@ -54,10 +54,10 @@ class Room:
 
 @dataclass
 class Placer:
-    """Collects things with rising ids, in room coordinates."""
+    """Collects objects with rising ids, in room coordinates."""
 
     rng: np.random.Generator
-    things: list[SimulatedThing] = field(default_factory=list)
+    objects: list[SimulatedObject] = field(default_factory=list)
 
     def add(
         self,
@@ -72,19 +72,19 @@ class Placer:
         on: int | None = None,
         inside: int | None = None,
         attached: int | None = None,
-    ) -> SimulatedThing:
-        """Put a thing at (x, y) of a room; `yaw_deg` turns its front from the room's +y."""
+    ) -> SimulatedObject:
+        """Put an object at (x, y) of a room; `yaw_deg` turns its front from the room's +y."""
         yaw = np.deg2rad(180.0 - yaw_deg if room.mirrored else yaw_deg)
         wx, wy = room.world_xy(x, y)
-        thing = SimulatedThing(len(self.things) + 1, label, parts, (wx, wy, z), float(yaw), on, inside, attached)
-        self.things.append(thing)
-        return thing
+        obj = SimulatedObject(len(self.objects) + 1, label, parts, (wx, wy, z), float(yaw), on, inside, attached)
+        self.objects.append(obj)
+        return obj
 
-    def add_structure(self, label: str, parts: f.Parts) -> SimulatedThing:
-        """Return a floor, wall or ceiling, whose parts are in world coordinates."""
-        thing = SimulatedThing(len(self.things) + 1, label, parts, (0.0, 0.0, 0.0), structure=label)
-        self.things.append(thing)
-        return thing
+    def add_structure(self, label: str, parts: f.Parts) -> SimulatedObject:
+        """Return a floor, wall or ceiling, its parts in world coordinates."""
+        obj = SimulatedObject(len(self.objects) + 1, label, parts, (0.0, 0.0, 0.0), structure=label)
+        self.objects.append(obj)
+        return obj
 
     def wood(self, tile_m: float = 0.8) -> Material:
         """Return a wood drawn from the palette."""
@@ -97,12 +97,12 @@ class Placer:
         return Material(kind, low, high, 0.6, int(self.rng.integers(1 << 16)))
 
     def bright(self, kind: str, tile_m: float) -> Material:
-        """Return a vivid surface for small things."""
+        """Return a vivid surface for small objects."""
         low, high = BRIGHT[self.rng.integers(len(BRIGHT))]
         return Material(kind, low, high, tile_m, int(self.rng.integers(1 << 16)))
 
     def small(self, kind: str) -> tuple[f.Parts, float]:
-        """Return the parts of a small thing and the radius that it takes up, metres."""
+        """Return the parts of a small object and the radius that it takes up, metres."""
         rng = self.rng
         if kind == "mug":
             radius = rng.uniform(0.042, 0.05)
@@ -127,13 +127,13 @@ class Placer:
     def scatter(
         self,
         room: Room,
-        support: SimulatedThing,
+        support: SimulatedObject,
         kinds: tuple[str, ...],
         width: float,
         depth: float,
         keep_xy: float = 0.0,
-    ) -> list[SimulatedThing]:
-        """Small things on the top of `support` at least 5 cm apart; the back `keep_xy` metres stay free."""
+    ) -> list[SimulatedObject]:
+        """Small objects on the top of `support` at least 5 cm apart; the back `keep_xy` metres stay free."""
         top = support.box().center[2] + support.box().size[2] / 2
         placed: list[tuple[float, float, float]] = []
         out = []
@@ -146,9 +146,9 @@ class Placer:
             offset = support.rotation()[:2, :2] @ np.array(spot)
             yaw = float(self.rng.uniform(0, 2 * np.pi))
             at = (support.position[0] + float(offset[0]), support.position[1] + float(offset[1]), float(top))
-            thing = SimulatedThing(len(self.things) + 1, kind, parts, at, yaw, support.id)
-            self.things.append(thing)
-            out.append(thing)
+            obj = SimulatedObject(len(self.objects) + 1, kind, parts, at, yaw, support.id)
+            self.objects.append(obj)
+            out.append(obj)
         return out
 
     def _free_spot(
@@ -168,10 +168,10 @@ def _pick(rng: np.random.Generator, *names: str) -> str:
     return names[rng.integers(len(names))]
 
 
-def _fill(placer: Placer, container: SimulatedThing, parts: f.Parts, label: str, z: float) -> None:
+def _fill(placer: Placer, container: SimulatedObject, parts: f.Parts, label: str, z: float) -> None:
     x, y, base = container.position
-    placer.things.append(
-        SimulatedThing(len(placer.things) + 1, label, parts, (x, y, base + z), 0.0, container.id, container.id)
+    placer.objects.append(
+        SimulatedObject(len(placer.objects) + 1, label, parts, (x, y, base + z), 0.0, container.id, container.id)
     )
 
 
@@ -184,9 +184,9 @@ def furnish_living_room(p: Placer, room: Room, walls: dict[str, int], floor: int
     w, d = rng.uniform(1.35, 1.5), rng.uniform(0.82, 0.9)
     table = p.add(room, "table", f.table((w, d, 0.74), p.wood(1.2)), 1.5, 2.75, rng.uniform(-4, 4), on=floor)
     small = p.scatter(room, table, ("bowl", "book", "box", "mug", "mug", "vase"), w, d)
-    for thing in small:
-        if thing.label == "bowl":
-            _fill(p, thing, f.ball(0.06, p.bright("dots", 0.3)), "ball", 0.035)
+    for obj in small:
+        if obj.label == "bowl":
+            _fill(p, obj, f.ball(0.06, p.bright("dots", 0.3)), "ball", 0.035)
     for x, y, yaw in ((1.75, 2.08, rng.uniform(-25, 25)), (0.47, 2.75, -90 + rng.uniform(-12, 12)), (1.4, 3.4, 180)):
         p.add(room, "chair", f.chair(wood, seat), x, y, yaw, on=floor)
     width = rng.uniform(1.7, 1.9)
@@ -215,7 +215,7 @@ def _bookshelf(p: Placer, room: Room, floor: int) -> None:
         parts, label = what
         offset = shelf.rotation()[:2, :2] @ np.array([x, 0.02])
         at = (shelf.position[0] + float(offset[0]), shelf.position[1] + float(offset[1]), level)
-        p.things.append(SimulatedThing(len(p.things) + 1, label, parts, at, shelf.yaw, shelf.id, shelf.id))
+        p.objects.append(SimulatedObject(len(p.objects) + 1, label, parts, at, shelf.yaw, shelf.id, shelf.id))
 
 
 def _shelf_plan(p: Placer) -> list[tuple[float, tuple[f.Parts, str]]]:

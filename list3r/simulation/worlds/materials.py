@@ -17,7 +17,7 @@ TEXTURE_PX = 256
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface looks like."""
+    """Appearance of a surface."""
 
     kind: str
     """A key of the table at the end of this file: plain, plaster, wood, fabric, stripes, checker, dots, print."""

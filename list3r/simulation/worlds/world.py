@@ -9,7 +9,7 @@ import numpy as np
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.layout import WOODS, Placer, Room, furnish_bedroom, furnish_living_room, wall_paint
 from list3r.simulation.worlds.materials import Material
-from list3r.simulation.worlds.things import SimulatedThing, Vec3
+from list3r.simulation.worlds.objects import SimulatedObject, Vec3
 
 WALL_M = 0.10
 DOOR_M = (0.95, 2.05)
@@ -19,7 +19,7 @@ HEIGHT_M = 2.5
 
 @dataclass(frozen=True)
 class Stop:
-    """Where the walker's head is and what it looks at, world, metres."""
+    """The camera's position and the point it looks at, world, metres."""
 
     eye: Vec3
     target: Vec3
@@ -27,21 +27,21 @@ class Stop:
 
 @dataclass(frozen=True)
 class SimulatedWorld:
-    """Rooms, things, lamps, and a way through."""
+    """Rooms, objects, lamps, and a way through."""
 
     seed: int
     rooms: tuple[Room, ...]
-    things: tuple[SimulatedThing, ...]
+    objects: tuple[SimulatedObject, ...]
     tour: tuple[Stop, ...]
     """A round through both rooms that comes back to where it starts."""
 
-    def thing(self, thing_id: int) -> SimulatedThing:
-        """Return the thing of an id. Raises `KeyError`."""
-        return {t.id: t for t in self.things}[thing_id]
+    def object_of(self, object_id: int) -> SimulatedObject:
+        """Return the object of an id. Raises `KeyError`."""
+        return {t.id: t for t in self.objects}[object_id]
 
 
 def make_world(seed: int = 0) -> SimulatedWorld:
-    """Return the world of a seed: sizes, colours, mirroring and small things are drawn from it."""
+    """Return the world of a seed: sizes, colours, mirroring and small objects are drawn from it."""
     rng = np.random.default_rng([seed, 1])
     depth = 3.8
     living = Room(0.0, 4.0, depth, bool(rng.integers(2)))
@@ -50,7 +50,7 @@ def make_world(seed: int = 0) -> SimulatedWorld:
     floors, walls = _shell(placer, (living, bedroom))
     furnish_living_room(placer, living, walls[0], floors[0])
     furnish_bedroom(placer, bedroom, walls[1], floors[1])
-    return SimulatedWorld(seed, (living, bedroom), tuple(placer.things), _tour(living, bedroom))
+    return SimulatedWorld(seed, (living, bedroom), tuple(placer.objects), _tour(living, bedroom))
 
 
 def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[str, int]]]:

@@ -1,4 +1,4 @@
-"""What clusters of parts are as wholes: structure, names, and whether a person would call each one thing."""
+"""Classification of clusters of parts: structure, names, and whether each is one whole object."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ Float = NDArray[np.float32]
 
 
 SHOWN_NODES = (2, 3, 4, *range(16, 26))
-"""Columns of the features of parts whose means verdicts are told from: slopes, colours, noise, what is before it."""
+"""Columns of the parts' features that are averaged for the classifier: slopes, colours, noise, occluders."""
 NODES_AT = 19
-"""Column of the first of them among the features of things."""
+"""Column of the first of them among the features of objects."""
 
 
 @dataclass(frozen=True)
-class ThingVerdicts:
-    """What is said of T things."""
+class SegmentVerdicts:
+    """Classification of T clusters."""
 
     structure: Float
-    """Probability that a thing is of what bounds the room. Shape (T,)."""
+    """Probability that it bounds the room. Shape (T,)."""
     whole: Float
-    """Calibrated probability that it is one thing and all of it. Shape (T,)."""
+    """Calibrated probability that it is one object and all of it. Shape (T,)."""
     names: Float
     """Calibrated probabilities of the names, see `names_of`. Shape (T, C)."""
 
-    def rows(self, rows: NDArray[np.int64]) -> ThingVerdicts:
-        """Return what is said of some things, in their order. `rows` has shape (R,)."""
-        return ThingVerdicts(self.structure[rows], self.whole[rows], self.names[rows])
+    def rows(self, rows: NDArray[np.int64]) -> SegmentVerdicts:
+        """Return the verdicts of some clusters, in their order. `rows` has shape (R,)."""
+        return SegmentVerdicts(self.structure[rows], self.whole[rows], self.names[rows])
 
 
 def names_of(weights: Weights) -> tuple[str, ...]:
@@ -43,19 +43,19 @@ def names_of(weights: Weights) -> tuple[str, ...]:
     return tuple(weights["names"].tolist())
 
 
-def classify_things(
+def classify_segments(
     weights: Weights,
     own: NDArray[np.int64],
     graph: PieceGraph,
-    told: Classification,
+    scores: Classification,
     confidence: NameConfidence | None = None,
-) -> ThingVerdicts:
+) -> SegmentVerdicts:
     """Classify clusters of parts; `own` is the cluster of each part, from 0. Shape (P,)."""
-    structure, x = thing_features(own, graph, told)
+    structure, x = segment_features(own, graph, scores)
     whole, names = first_verdicts(weights, x)
     signs = name_signs(names, whole, structure)
     names = with_confidence(names, (confidence or NameConfidence()).probability(signs))
-    return ThingVerdicts(structure.astype(np.float32), whole.astype(np.float32), names.astype(np.float32))
+    return SegmentVerdicts(structure.astype(np.float32), whole.astype(np.float32), names.astype(np.float32))
 
 
 def first_verdicts(weights: Weights, x: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -70,10 +70,10 @@ def first_verdicts(weights: Weights, x: NDArray[np.float32]) -> tuple[NDArray[np
     return whole.astype(np.float64), names / names.sum(axis=1, keepdims=True)
 
 
-def thing_features(
-    own: NDArray[np.int64], graph: PieceGraph, told: Classification
+def segment_features(
+    own: NDArray[np.int64], graph: PieceGraph, scores: Classification
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return how probably each cluster is structure (T,), and what verdicts are told from (T, F)."""
+    """Return the probability that each cluster is structure (T,), and the classifier's inputs (T, F)."""
     count, size = int(own.max(initial=-1)) + 1, graph.moments[:, 0].astype(np.float64)
     total = np.maximum(np.bincount(own, size, minlength=count), 1.0)
 
@@ -82,22 +82,22 @@ def thing_features(
         sums = [np.bincount(own, table[:, k] * size, minlength=count) for k in range(table.shape[1])]
         return np.stack(sums, axis=1) / total[:, None]
 
-    bound = 1.0 / (1.0 + np.exp(-np.clip(told.structure.astype(np.float64), -20, 20)))
+    bound = 1.0 / (1.0 + np.exp(-np.clip(scores.structure.astype(np.float64), -20, 20)))
     structure = mean(bound)[:, 0]
-    most = np.full((count, told.hidden.shape[1]), -np.inf)
-    np.maximum.at(most, own, told.hidden)
+    most = np.full((count, scores.hidden.shape[1]), -np.inf)
+    np.maximum.at(most, own, scores.hidden)
     columns = [
         np.log(total),
         structure,
         np.log(np.maximum(np.bincount(own, minlength=count), 1)),
-        *_borders(own, graph, told, np.sqrt(total), bound),
+        *_borders(own, graph, scores, np.sqrt(total), bound),
         *_shape(own, graph, mean, count),
         mean(graph.nodes[:, list(SHOWN_NODES)]),
         mean((graph.nodes[:, 3] > 0.8) * 1.0),
         mean((graph.nodes[:, 3] < 0.3) * 1.0),
-        mean(told.hidden),
+        mean(scores.hidden),
         most,
-        mean(np.maximum(told.names, -12.0)),
+        mean(np.maximum(scores.names, -12.0)),
     ]
     return structure, np.column_stack(columns).astype(np.float32)
 
@@ -105,14 +105,14 @@ def thing_features(
 def _borders(
     own: NDArray[np.int64],
     graph: PieceGraph,
-    told: Classification,
+    scores: Classification,
     outline: NDArray[np.float64],
     bound: NDArray[np.float64],
 ) -> list[NDArray[np.float64]]:
     """How tight clusters are inside, how loose outside, and how much of their rim is at structure. Shape (T,) each."""
     count = len(outline)
     a, b = own[graph.left], own[graph.right]
-    score, weight = np.clip(told.affinity, -STRONGEST, STRONGEST).astype(np.float64), graph.weight.astype(np.float64)
+    score, weight = np.clip(scores.affinity, -STRONGEST, STRONGEST).astype(np.float64), graph.weight.astype(np.float64)
     inside = a == b
     tight = np.bincount(a[inside], (score * weight)[inside], minlength=count)
     held = np.bincount(a[inside], weight[inside], minlength=count)

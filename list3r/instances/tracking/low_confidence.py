@@ -1,4 +1,4 @@
-"""What is too seldom one thing to be listed, kept as it is seen on the anchors."""
+"""Low-confidence segments: not listed, kept as seen on the anchors."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from list3r.instances.tracking.reprojection import LabelledChunk
 from list3r.memory.records import LocalInstance
 
 
-def scrap_instances(
+def low_confidence_instances(
     views: ChunkViews, proposals: Sequence[Proposals], settings: InstanceSettings, first_id: int
 ) -> tuple[LocalInstance, ...]:
-    """Return the scraps of a chunk, with local ids from `first_id` on; a discoverer tells them by `identity`.
-
-    They are seen on anchors alone: what is not listed is not worth following from frame to frame.
+    """Return the low-confidence segments of a chunk, with local ids from `first_id` on, grouped by `identity`. They are
+    seen on anchors alone: tracking them from frame to frame is not worth the time.
     """
-    numbered = [(p, identity_of(p)) for p in proposals if len(p.score)]
+    numbered = [(p, p.identity) for p in proposals if p.identity is not None and len(p.score)]
     if not numbered:
         return ()
-    kept, numbers, s = [p for p, _ in numbered], [n for _, n in numbered], settings.scraps
+    kept, numbers, s = [p for p, _ in numbered], [n for _, n in numbered], settings.low_confidence
     count = 1 + max(int(n.max()) for n in numbers)
     stride, images = views.stride, dict[int, NDArray[np.int32]]()
     for p, n in numbered:
@@ -41,9 +40,3 @@ def scrap_instances(
             seen = track.record((camera.height, camera.width))
             out.append(LocalInstance(first_id + len(out), seen, feature[number], support, whole[number]))
     return tuple(out)
-
-
-def identity_of(proposals: Proposals) -> NDArray[np.int64]:
-    """Return the thing that each candidate is a view of, which its discoverer must know. Shape (N,)."""
-    assert proposals.identity is not None
-    return proposals.identity

@@ -1,4 +1,4 @@
-"""Anchor views laid on one another: what is left of pose drift inside a chunk would double every far surface."""
+"""Registration of anchor views: remaining pose drift inside a chunk would double every far surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things made of boxes, cylinders and spheres, and all solids of a world as arrays for the renderer."""
+"""Objects made of boxes, cylinders and spheres, and all solids of a world as arrays for the renderer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Vec3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Part:
-    """One solid, upright, in the frame of its thing: origin in the middle of the base, z up, front towards +y."""
+    """One solid, upright, in the frame of its object: origin in the middle of the base, z up, front towards +y."""
 
     kind: int
     """BOX, CYLINDER (axis z) or SPHERE."""
@@ -28,7 +28,7 @@ class Part:
     """Half extents, metres; the first two equal for a cylinder, all three for a sphere."""
     material: Material
     yaw: float = 0.0
-    """Turn about z within the thing, radians."""
+    """Turn about z within the object, radians."""
     open_top: bool = False
     """A cylinder without its upper cap, or a sphere without its upper half: thin shells with a visible inside."""
 
@@ -46,8 +46,8 @@ class Part:
 
 
 @dataclass(frozen=True)
-class SimulatedThing:
-    """One physical thing with what is true of it."""
+class SimulatedObject:
+    """One physical object with its ground truth."""
 
     id: int
     label: str
@@ -57,16 +57,16 @@ class SimulatedThing:
     yaw: float = 0.0
     """Turn about the world's z, radians."""
     support: int | None = None
-    """Id of the thing it rests on."""
+    """Id of the object it rests on."""
     container: int | None = None
-    """Id of the thing it is in."""
+    """Id of the object it is in."""
     attached: int | None = None
     """Id of the wall it hangs on."""
     structure: str | None = None
-    """floor, wall or ceiling for what bounds the room."""
+    """floor, wall or ceiling where it bounds the room."""
 
     def is_round(self) -> bool:
-        """Return whether it looks the same from all sides, so that the yaw of its box means nothing."""
+        """Return whether it is rotationally symmetric, so that the yaw of its box is arbitrary."""
         return all(part.kind != BOX and part.center[:2] == (0, 0) for part in self.parts)
 
     def rotation(self) -> Array:
@@ -83,10 +83,10 @@ class SimulatedThing:
 
 
 @dataclass(frozen=True)
-class MovingThing:
-    """A thing with a pose of its own in every frame."""
+class MovingObject:
+    """An object with a pose of its own in every frame."""
 
-    thing: SimulatedThing
+    obj: SimulatedObject
     """At the origin."""
     T_world_object: Array
     """Upright poses. Shape (F, 4, 4)."""
@@ -108,8 +108,8 @@ class Solids:
     """Shape (N,)."""
     material: NDArray[np.int64]
     """Index into `materials`. Shape (N,)."""
-    thing: NDArray[np.int64]
-    """Id of the thing. Shape (N,)."""
+    object_id: NDArray[np.int64]
+    """Id of the object. Shape (N,)."""
     materials: tuple[Material, ...]
 
     def corners(self) -> Array:
@@ -123,9 +123,9 @@ class Solids:
         return np.asarray(turned + self.center[:, None, :])
 
 
-def stack_solids(things: Sequence[SimulatedThing]) -> Solids:
-    """Return the parts of all things in the world frame."""
-    pairs = [(thing, part) for thing in things for part in thing.parts]
+def stack_solids(objects: Sequence[SimulatedObject]) -> Solids:
+    """Return the parts of all objects in the world frame."""
+    pairs = [(obj, part) for obj in objects for part in obj.parts]
     materials = tuple(dict.fromkeys(part.material for _, part in pairs))
     index = {material: k for k, material in enumerate(materials)}
     return Solids(
@@ -135,6 +135,6 @@ def stack_solids(things: Sequence[SimulatedThing]) -> Solids:
         yaw=np.array([t.yaw + p.yaw for t, p in pairs]),
         open_top=np.array([p.open_top for _, p in pairs]),
         material=np.array([index[p.material] for _, p in pairs]),
-        thing=np.array([t.id for t, _ in pairs]),
+        object_id=np.array([t.id for t, _ in pairs]),
         materials=materials,
     )
