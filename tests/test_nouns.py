@@ -21,7 +21,8 @@ from list3r.memory.description.nouns import (
     uses,
     usual_size_cm,
 )
-from list3r.memory.description.words import kind_word, split_words, vocabulary
+from list3r.memory.description.spelling import split_words
+from list3r.memory.description.words import kind_word, vocabulary
 
 NOUNS = st.sampled_from(sorted(all_nouns()))
 

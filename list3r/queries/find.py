@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.words import adjectives, kind_word, split_words, vocabulary
+from list3r.memory.description.spelling import adjectives, split_words
+from list3r.memory.description.words import kind_word, vocabulary
 from list3r.memory.errors import OptionError, UnknownIdError
 from list3r.memory.records import Instance
 from list3r.memory.store.store import Store

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import pack
 from list3r.memory.geometry import Array
-from list3r.memory.overlap.visibility import FREE, MET, DepthView, VisibilitySettings, point_visibility
+from list3r.memory.overlap.point_verdicts import FREE, MET
+from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, point_visibility
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

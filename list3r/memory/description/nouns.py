@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 
-from list3r.memory.description.words import split_words
+from list3r.memory.description.spelling import split_words
 
 _COLLECTIVE = frozenset("pile stack row pair set bunch group piece pieces pairs lot collection".split())
 LANGUAGES = ("de", "fr", "es", "it", "ja", "zh")

@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
-from functools import cache, lru_cache
-from pathlib import Path
+from functools import lru_cache
+
+from list3r.memory.description.nouns import nouns_of
+from list3r.memory.description.spelling import split_words
 
 _HEAD = 0.98
 """How well the last words of a label name a kind of thing, as "chair" does an office chair."""
-
-
-@cache
-def _same() -> dict[str, str]:
-    """Irregular plurals, and colours, sizes and shapes in one word for many."""
-    table: dict[str, dict[str, str]] = json.loads(Path(__file__).with_name("words.json").read_text(encoding="utf-8"))
-    return {word: one for group in table.values() for one, many in group.items() for word in many.split()}
-
-
-@cache
-def adjectives() -> frozenset[str]:
-    """Return the words of colour, size and shape that descriptions use: of what none has, it is known."""
-    return frozenset(_same().values()) | {"light", "dark", "orange", "beige", "tan", "medium", "box", "bar", "slab"}
 
 
 def vocabulary(label: str | None, structure: str | None, description: str, color_name: str) -> dict[str, float]:
@@ -48,8 +35,6 @@ def vocabulary(label: str | None, structure: str | None, description: str, color
 
 @lru_cache(maxsize=4096)
 def _kinds(label: str | None, structure: str | None, described: str) -> dict[str, float]:
-    from list3r.memory.description.nouns import nouns_of  # it splits words too
-
     if label is None:
         return {kind_word(n): 0.9 for text in (structure or "", described) for n in nouns_of(text)}
     first, *others = nouns_of(label) or ("",)
@@ -60,26 +45,3 @@ def _kinds(label: str | None, structure: str | None, described: str) -> dict[str
 def kind_word(noun: str) -> str:
     """Return the word under which an index keeps all that is called a noun, by whatever name: "_office_chair"."""
     return "_" + noun.replace(" ", "_")
-
-
-def split_words(text: str) -> list[str]:
-    """Return the words of a text in lower case, plurals as singulars, other spellings of an adjective as one."""
-    return list(_split(text))
-
-
-@lru_cache(maxsize=4096)
-def _split(text: str) -> tuple[str, ...]:
-    """Descriptions repeat: thousands of instances are a small red box."""
-    return tuple(_singular(w) for w in re.findall(r"[^\W_]+", text.lower()))
-
-
-def _singular(word: str) -> str:
-    same = _same()
-    if word in same:
-        return same[word]
-    if len(word) > 3 and word.endswith("s") and not word.endswith(("ss", "us", "is")):
-        if word.endswith("ies") and len(word) > 4:
-            word = word[:-3] + "y"
-        else:
-            word = word[:-2] if word.endswith(("ches", "shes", "xes", "sses", "zes")) else word[:-1]
-    return same.get(word, word)

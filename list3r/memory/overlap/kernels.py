@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.compiled import compiled
-from list3r.memory.overlap.visibility import FREE, MET, UNTOLD
+from list3r.memory.overlap.point_verdicts import FREE, MET, UNTOLD
 
 
 @compiled

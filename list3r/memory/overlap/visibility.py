@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.geometry import Array, Sim3
+from list3r.memory.overlap.point_verdicts import FREE, MET
 from list3r.memory.records import ChunkRow, Keyframe
 
 Ints = NDArray[np.int64]
@@ -147,10 +148,6 @@ def place_visibility(
         verdict, kept = "unclear", np.ones(len(verdicts), bool)
     best = sorted((t for t, k in zip(verdicts, kept, strict=True) if k), key=lambda t: (-t[0], t[2]))
     return PlaceVisibility(verdict, share, tuple(t[2] for t in best), verdict == "gone" and other is not None)
-
-
-UNTOLD, MET, FREE = 0, 1, 2
-"""What a frame tells about one point: nothing, a surface where it should be, free space through it."""
 
 
 def point_visibility(points: Array, view: DepthView, s: VisibilitySettings) -> NDArray[np.int8]:

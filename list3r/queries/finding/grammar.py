@@ -17,7 +17,7 @@ import string
 from dataclasses import dataclass, replace
 
 from list3r.memory.description.nouns import is_a
-from list3r.memory.description.words import adjectives, split_words
+from list3r.memory.description.spelling import adjectives, split_words
 from list3r.memory.errors import OptionError
 from list3r.queries.finding.tokens import (
     ENDS,

@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from list3r.memory.description.nouns import nouns_of
-from list3r.memory.description.words import kind_word, split_words, vocabulary
+from list3r.memory.description.spelling import split_words
+from list3r.memory.description.words import kind_word, vocabulary
 from list3r.memory.errors import OptionError
 from list3r.memory.records import Instance
 
