@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, FrameSource
 from list3r.frames.options import SourceOptions
+from list3r.frames.recordings.stamps import as_seconds
 from list3r.frames.source import open_source
 from list3r.memory.errors import List3rError, SourceError
 from tests.frames_scenes import color_image, depth_image, moved, write_png, write_tum
@@ -318,3 +319,19 @@ def test_a_folder_in_disorder_is_read_whole_or_refused_in_one_line(seed: int, tm
     assert info.has_poses == (posed > 0) or "pose" in said, said
     for frame in itertools.islice(source.read(0, info.frame_count), 20):
         assert isinstance(frame, Frame) or "\n" not in frame.reason
+
+
+@pytest.mark.parametrize("per_s", [1, 10**3, 10**6, 10**9])
+@pytest.mark.parametrize("begin_s", [40, 50_000, 1_700_000_000])
+def test_stamps_of_any_unit_are_seconds(per_s: int, begin_s: int) -> None:
+    if per_s == 1000 and begin_s < 1e6:
+        pytest.skip("milliseconds from elsewhere may be seconds")
+    true_s = begin_s + np.arange(20) / 30
+    assert np.allclose(as_seconds(true_s * per_s), true_s, rtol=1e-9)
+
+
+def test_a_camera_that_is_given_stands_for_a_file_without_one(tmp_path: Path) -> None:
+    path = write(tmp_path / "walk", lambda k: f"rgb/{k}.jpg", lambda k: f"depth/{k}.png")
+    put(path / "intrinsic.json", "{}")
+    info = open_source(path, SourceOptions(intrinsics=K, depth_scale=1000.0)).info
+    assert info.camera is not None and any("not read: intrinsic.json" in note for note in info.notes)

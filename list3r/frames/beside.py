@@ -269,7 +269,7 @@ def _by_list(path: Path, colors: Sequence[Path], others: Sequence[Path]) -> Pair
             times_s[place[named[color]]] = float(words[color - 1])
     if not any(files):
         raise SourceError(f"{path} names no picture together with a depth image that is there; fix or remove it")
-    return Pairs(files, path.name, as_seconds(times_s)[0] if np.isfinite(times_s).all() else None)
+    return Pairs(files, path.name, as_seconds(times_s) if np.isfinite(times_s).all() else None)
 
 
 # ---------------------------------------------------------------------------------------------- the law
