@@ -19,8 +19,9 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.stamps import as_seconds
 from list3r.frames.source import open_source
 from list3r.memory.errors import List3rError, SourceError
-from tests.frames_scenes import color_image, depth_image, moved, write_png, write_tum
-from tests.recordings import exr, put
+from tests.frames_scenes import color_image, depth_image, moved, write_png, write_replica, write_tum
+from tests.recordings import exr, put, shots
+from tests.recordings_robots import write_video
 from tests.test_frames_recordings import frames_of
 
 MM = SourceOptions(depth_scale=1000.0)
@@ -39,6 +40,11 @@ def write(root: Path, color: Callable[[int], str], depth: Callable[[int], str], 
         write_png(root / color(k), color_image(k))
         write_png(root / depth(k), depth_of(k))
     return root
+
+
+def write_film(path: Path) -> Path:
+    write_video(path, [shot.color for shot in shots()])
+    return path
 
 
 def told(source: FrameSource) -> str:
@@ -160,6 +166,31 @@ def test_pictures_of_another_size_are_counted(tmp_path: Path) -> None:
     for k in (3, 17):
         write_png(path / f"rgb/{k}.png", color_image(k, 64, 48))
     assert "2 of 40 pictures looked at are of another size (64x48) than most (80x60)" in told(open_source(path, MM))
+
+
+def test_pictures_on_their_side_are_of_another_size(tmp_path: Path) -> None:
+    for k in range(8):
+        write_png(tmp_path / f"{k}.png", color_image(k, *((60, 80) if k % 4 == 0 else (80, 60))))
+    assert "2 of 8 pictures looked at are of another size (60x80)" in told(open_source(tmp_path))
+
+
+def test_depth_that_only_its_pixels_tell_is_not_dropped(tmp_path: Path) -> None:
+    path = write_replica(tmp_path / "walk")
+    for file in sorted((path / "results").glob("depth*")):
+        file.rename(file.with_name(file.name.replace("depth", "z")))
+    with pytest.raises(SourceError, match=r"z000000\.png looks like depth"):
+        open_source(path)
+    assert not open_source(path, SourceOptions(kind="replica")).info.has_depth
+
+
+def test_a_video_with_depth_beside_it_is_refused_and_can_be_asked_for(tmp_path: Path) -> None:
+    path = write_film(tmp_path / "walk.mp4")
+    assert open_source(path).info.frame_count > 0
+    for k in range(COUNT):
+        write_png(tmp_path / f"depth/{k}.png", depth_of(k))
+    with pytest.raises(SourceError, match="has depth beside it, depth, which would be lost"):
+        open_source(path)
+    assert not open_source(path, SourceOptions(kind="video")).info.has_depth
 
 
 FOUR = {"fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": 29.0}
