@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import random
 import shutil
@@ -15,11 +14,17 @@ import pytest
 from numpy.typing import NDArray
 
 from list3r.frames.base import BadFrame, Frame, FrameSource
+from list3r.frames.inspection import SourceReport
 from list3r.frames.options import SourceOptions
+from list3r.frames.pose_agreement import disagreements
+from list3r.frames.quick_look import unusable
+from list3r.frames.recordings.stamps import as_seconds
+from list3r.frames.registration.edge_look import depth_doubts
 from list3r.frames.source import open_source
 from list3r.memory.errors import List3rError, SourceError
-from tests.frames_scenes import color_image, depth_image, moved, write_png, write_tum
-from tests.recordings import exr, put
+from tests.frames_scenes import color_image, depth_image, moved, write_png, write_replica, write_tum
+from tests.recordings import exr, put, shots
+from tests.recordings_robots import write_video
 from tests.test_frames_recordings import frames_of
 
 MM = SourceOptions(depth_scale=1000.0)
@@ -38,6 +43,11 @@ def write(root: Path, color: Callable[[int], str], depth: Callable[[int], str], 
         write_png(root / color(k), color_image(k))
         write_png(root / depth(k), depth_of(k))
     return root
+
+
+def write_film(path: Path) -> Path:
+    write_video(path, [shot.color for shot in shots()])
+    return path
 
 
 def told(source: FrameSource) -> str:
@@ -159,6 +169,31 @@ def test_pictures_of_another_size_are_counted(tmp_path: Path) -> None:
     for k in (3, 17):
         write_png(path / f"rgb/{k}.png", color_image(k, 64, 48))
     assert "2 of 40 pictures looked at are of another size (64x48) than most (80x60)" in told(open_source(path, MM))
+
+
+def test_pictures_on_their_side_are_of_another_size(tmp_path: Path) -> None:
+    for k in range(8):
+        write_png(tmp_path / f"{k}.png", color_image(k, *((60, 80) if k % 4 == 0 else (80, 60))))
+    assert "2 of 8 pictures looked at are of another size (60x80)" in told(open_source(tmp_path))
+
+
+def test_depth_that_only_its_pixels_tell_is_not_dropped(tmp_path: Path) -> None:
+    path = write_replica(tmp_path / "walk")
+    for file in sorted((path / "results").glob("depth*")):
+        file.rename(file.with_name(file.name.replace("depth", "z")))
+    with pytest.raises(SourceError, match=r"z000000\.png looks like depth"):
+        open_source(path)
+    assert not open_source(path, SourceOptions(kind="replica")).info.has_depth
+
+
+def test_a_video_with_depth_beside_it_is_refused_and_can_be_asked_for(tmp_path: Path) -> None:
+    path = write_film(tmp_path / "walk.mp4")
+    assert open_source(path).info.frame_count > 0
+    for k in range(COUNT):
+        write_png(tmp_path / f"depth/{k}.png", depth_of(k))
+    with pytest.raises(SourceError, match="has depth beside it, depth, which would be lost"):
+        open_source(path)
+    assert not open_source(path, SourceOptions(kind="video")).info.has_depth
 
 
 FOUR = {"fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": 29.0}
@@ -316,5 +351,22 @@ def test_a_folder_in_disorder_is_read_whole_or_refused_in_one_line(seed: int, tm
     info, said = source.info, told(source)
     assert info.has_depth == (deep > 0) or "depth" in said, said
     assert info.has_poses == (posed > 0) or "pose" in said, said
-    for frame in itertools.islice(source.read(0, info.frame_count), 20):
-        assert isinstance(frame, Frame) or "\n" not in frame.reason
+    lines = SourceReport(info, None, None, unusable(source), depth_doubts(source), disagreements(source)).lines()
+    bad = sum(isinstance(f, BadFrame) for f in source.read(0, info.frame_count))
+    assert not bad or any(f"{bad} of {info.frame_count} frames cannot be used" in line for line in lines), lines
+
+
+@pytest.mark.parametrize("per_s", [1, 10**3, 10**6, 10**9])
+@pytest.mark.parametrize("begin_s", [40, 50_000, 1_700_000_000])
+def test_stamps_of_any_unit_are_seconds(per_s: int, begin_s: int) -> None:
+    if per_s == 1000 and begin_s < 1e6:
+        pytest.skip("milliseconds from elsewhere may be seconds")
+    true_s = begin_s + np.arange(20) / 30
+    assert np.allclose(as_seconds(true_s * per_s), true_s, rtol=1e-9)
+
+
+def test_a_camera_that_is_given_stands_for_a_file_without_one(tmp_path: Path) -> None:
+    path = write(tmp_path / "walk", lambda k: f"rgb/{k}.jpg", lambda k: f"depth/{k}.png")
+    put(path / "intrinsic.json", "{}")
+    info = open_source(path, SourceOptions(intrinsics=K, depth_scale=1000.0)).info
+    assert info.camera is not None and any("not read: intrinsic.json" in note for note in info.notes)

@@ -94,16 +94,16 @@ def look(root: Path, *, alone: bool = False) -> Found | None:
     `alone`: depth that lies beside the folder itself may be left. Raises `SourceError` for a folder of depth, and where
     several folders may be the depth.
     """
-    own = _by_role(root)
+    own, here = _by_role(root), root.resolve()
     folders = {p: _by_role(p) for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")}
     folder = root if own["color"] else _color_folder(root, folders)
     if folder is None:
         if own["depth"] and _all_deep(own["depth"]):
             raise SourceError(f"{root} holds depth images and no pictures; give the folder that holds both")
         return None
-    if folder == root and not alone and (deeper := _of_parent(root)):
+    if folder == root and not alone and role_of(here.name) == "color" and (deeper := depth_beside(here)):
         raise SourceError(
-            f"{root} has depth beside it, {deeper}/, which would be lost; give the folder {root.parent}, or use --kind "
+            f"{root} has depth beside it, {deeper}, which would be lost; give the folder {here.parent}, or use --kind "
             "images to take colour alone"
         )
     inside = own if folder == root else folders[folder]
@@ -180,14 +180,6 @@ def _all_deep(images: list[Path]) -> bool:
 
 _SAMPLED = 9
 _REGISTERED = re.compile("regist|align", re.IGNORECASE)
-
-
-def _of_parent(root: Path) -> str:
-    """The folder of depth that lies beside a folder of pictures; empty for none."""
-    if role_of(root.resolve().name) != "color":
-        return ""
-    beside = (p for p in sorted(root.resolve().parent.iterdir()) if p.is_dir() and role_of(p.name) == "depth")
-    return next((p.name for p in beside if any(map(is_deep, listed(p, _DEPTH_ENDINGS)[:1]))), "")
 
 
 # ---------------------------------------------------------------------------------------------- what belongs together
@@ -269,10 +261,32 @@ def _by_list(path: Path, colors: Sequence[Path], others: Sequence[Path]) -> Pair
             times_s[place[named[color]]] = float(words[color - 1])
     if not any(files):
         raise SourceError(f"{path} names no picture together with a depth image that is there; fix or remove it")
-    return Pairs(files, path.name, as_seconds(times_s)[0] if np.isfinite(times_s).all() else None)
+    return Pairs(files, path.name, as_seconds(times_s) if np.isfinite(times_s).all() else None)
 
 
 # ---------------------------------------------------------------------------------------------- the law
+
+
+def _looks_deep(path: Path) -> bool:
+    """Whether a file or folder is depth by its name, or by what its images are."""
+    role = role_of(path.name)
+    if path.name.lower().endswith(_TEXTS) or role not in ("depth", None):
+        return False
+    images = listed(path, IMAGE_ENDINGS) if path.is_dir() else [path] if path.suffix.lower() in IMAGE_ENDINGS else []
+    return role == "depth" or (bool(images) and path.exists() and _all_deep(images))
+
+
+def depth_beside(colors: Path) -> str:
+    """Return the name of the depth that lies beside a video or a folder of pictures; empty for none.
+
+    It is a folder of depth, or, where the other says that it is colour, of the same kind as that.
+    """
+    for path in sorted(colors.parent.iterdir()):
+        like = role_of(colors.stem) == "color" and path.suffix.lower() == colors.suffix.lower()
+        images = listed(path, _DEPTH_ENDINGS)
+        if path != colors and role_of(path.stem) == "depth" and (like or (bool(images) and _all_deep(images))):
+            return path.name
+    return ""
 
 
 _TEXTS = (".txt", ".json", ".xml", ".yaml", ".yml", ".csv", ".md")
@@ -285,7 +299,7 @@ def refuse_left(root: Path, kind: str, left: Iterable[str], *, depth: bool, pose
     """
     for name in left:
         base = name.rstrip("/").rsplit("/", 1)[-1]
-        if not depth and role_of(base) == "depth" and not base.lower().endswith(_TEXTS):
+        if not depth and _looks_deep(root / name):
             what, wanted = "depth", "16-bit PNG, TIFF, NumPy or EXR images named as the pictures are, in depth/"
         elif not poses and _POSES.fullmatch(base):
             what, wanted = "poses", "poses.txt with a row for each picture (12 numbers, or time_s tx ty tz qx qy qz qw)"

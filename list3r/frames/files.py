@@ -58,21 +58,6 @@ def too_many_pixels(data: bytes) -> tuple[int, int] | None:
     return size if size is not None and size[0] * size[1] > MAX_PIXELS else None
 
 
-def picture_size(path: object) -> tuple[int, int] | None:
-    """Return the longer and the shorter side of a picture in a file of its own, by its first 64 KiB, else None."""
-    if not isinstance(path, Path):
-        return None
-    try:
-        with open_ordinary(path) as file:
-            size = _claimed_size(file.read(_HEAD_BYTES))
-    except OSError:
-        return None
-    return None if size is None else (max(size), min(size))
-
-
-_HEAD_BYTES = 2**16
-
-
 def _claimed_size(data: bytes) -> tuple[int, int] | None:
     """Width and height by the head of a PNG, JPEG or other picture; None where it says nothing that is understood."""
     if data.startswith(b"\x89PNG") and len(data) >= 24:

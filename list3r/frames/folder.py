@@ -28,10 +28,9 @@ from list3r.frames.decoding.decode import (
     sure_depth,
     used_bits,
 )
-from list3r.frames.decoding.exif import exif_focal
+from list3r.frames.decoding.exif import exif_focal, stated_size
 from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
 from list3r.frames.deferred import LazyFrame
-from list3r.frames.files import picture_size
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
@@ -294,7 +293,11 @@ class FolderSource(Reader):
             )
         tried = np.unique((np.linspace(0, 1, _FILES_TRIED) ** 1.1 * (len(files) - 1)).round()).astype(int).tolist()
         some = [files[k] for k in tried if k not in empty]
-        sizes = Counter(size for k in _spread(len(files), _SIZES_LOOKED_AT) if (size := picture_size(files[k].color)))
+        sizes = Counter(
+            size
+            for k in _spread(len(files), _SIZES_LOOKED_AT)
+            if (size := stated_size(files[k].color, self._layout.upright_tags))
+        )
         if len(sizes) > 1:
             (usual, most), total = sizes.most_common(1)[0], sum(sizes.values())
             others = ", ".join(f"{w}x{h}" for w, h in [s for s, _ in sizes.most_common(4)][1:])

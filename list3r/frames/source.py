@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from list3r.frames.base import Camera, FrameSource, Listing, SourceInfo
-from list3r.frames.beside import listed, role_of
+from list3r.frames.beside import depth_beside, listed, role_of
 from list3r.frames.folder import FolderSource
 from list3r.frames.layout import IMAGE_ENDINGS, FolderLayout
 from list3r.frames.live.addresses import is_stream, without_secrets
@@ -198,6 +198,11 @@ def _open_file(path: Path, options: SourceOptions) -> FrameSource:
         raise SourceError(
             f"{path} is the video of a Stray Scanner recording, whose depth and poses would be lost; give the folder "
             f"{path.parent}, or use --kind video to take its colour alone"
+        )
+    if options.kind == "auto" and (depth := depth_beside(path)):
+        raise SourceError(
+            f"{path} has depth beside it, {depth}, which would be lost; write its pictures beside the depth (ffmpeg -i "
+            f"{path.name} rgb/%06d.png) and give the folder of both, or use --kind video to take colour alone"
         )
     from list3r.frames.readers.video import VideoSource
 

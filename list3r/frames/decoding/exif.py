@@ -13,7 +13,9 @@ from typing import Any
 
 from list3r.frames.files import check_ordinary
 
-_EXIF_IFD = 0x8769
+_EXIF_IFD, _ORIENTATION = 0x8769, 0x0112
+_QUARTER = (5, 6, 7, 8)
+"""Orientations that lie on their side."""
 _FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405
 _WIDTH, _HEIGHT = 0xA002, 0xA003
 _PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
@@ -25,6 +27,25 @@ _PLAUSIBLE = (0.3, 6.0)
 
 def exif_focal(path: Path) -> float | None:
     """Focal length of the picture as stored, px; None where its EXIF says nothing that can be believed."""
+    head = _head(path)
+    if head is None:
+        return None
+    width, height, _, tags = head
+    if _cropped(tags, width, height):
+        return None
+    return believable(_from_film(tags, width, height) or _from_sensor(tags, width, height), width, height)
+
+
+def stated_size(path: object, upright: bool) -> tuple[int, int] | None:
+    """Width and height by the head of a picture in a file of its own, `upright` as its EXIF says; None if unknown."""
+    head = _head(path) if isinstance(path, Path) else None
+    if head is None:
+        return None
+    return head[1::-1] if upright and head[2] else head[:2]
+
+
+def _head(path: Path) -> tuple[int, int, bool, dict[int, Any]] | None:
+    """Width and height as stored, whether it is to be turned by a quarter, and the tags of its camera."""
     from PIL import Image
 
     try:
@@ -32,13 +53,10 @@ def exif_focal(path: Path) -> float | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                width, height = image.size
-                tags: dict[int, Any] = dict(image.getexif().get_ifd(_EXIF_IFD))
+                exif = image.getexif()
+                return *image.size, exif.get(_ORIENTATION, 1) in _QUARTER, dict(exif.get_ifd(_EXIF_IFD))
     except (OSError, ValueError, SyntaxError, KeyError, TypeError, Image.DecompressionBombError):
         return None
-    if _cropped(tags, width, height):
-        return None
-    return believable(_from_film(tags, width, height) or _from_sensor(tags, width, height), width, height)
 
 
 def film_focal(focal_35mm: float, width: int, height: int) -> float:

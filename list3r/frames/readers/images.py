@@ -15,7 +15,7 @@ from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.tum import poses_at
-from list3r.frames.recordings.camera_files import read_camera
+from list3r.frames.recordings.camera_files import StatedCamera, read_camera
 from list3r.frames.recordings.pose_lists import PoseList, read_pose_list
 from list3r.frames.recordings.stamps import times_of_names
 from list3r.memory.errors import SourceError
@@ -51,7 +51,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
             strict=True,
         )
     )
-    camera = read_camera(root)
+    camera = _camera(root, options)
     notes = [f"depth belongs to the pictures by {depths.how}"] if depths else []
     if depths and (alone := len(found.depths) - len(set(depths.files) - {None})):
         notes.append(f"{alone} of {len(found.depths)} depth images belong to no picture")
@@ -79,6 +79,16 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         least_confidence=1 if confidences else None,
         read=(*read, *((depths.how,) if depths else ())),
     )
+
+
+def _camera(root: Path, options: SourceOptions) -> StatedCamera | None:
+    """The camera of a file. Raises `SourceError` for a file without one, unless the user says it."""
+    try:
+        return read_camera(root)
+    except SourceError:
+        if options.intrinsics is None:
+            raise
+        return None
 
 
 def _beside(found: Found) -> tuple[tuple[list[Path], str], ...]:

@@ -159,7 +159,7 @@ def _read_list(path: Path) -> _TimedNames:
         ends.append(len(names))
     if not times_s:
         raise SourceError(f"{path} names no image; is the copy complete?")
-    found = _TimedNames(as_seconds(np.frombuffer(times_s))[0], bytes(names), np.frombuffer(ends, np.int64))
+    found = _TimedNames(as_seconds(np.frombuffer(times_s)), bytes(names), np.frombuffer(ends, np.int64))
     if np.all(np.diff(found.times_s) > 0):
         return found
     rows = sorted((time, found.name(k)) for k, time in enumerate(found.times_s.tolist()))
@@ -174,7 +174,7 @@ def _poses(path: Path, times_s: NDArray[np.float64]) -> Iterator[NDArray[np.floa
         if len(row) >= 8 and all(map(math.isfinite, row[:8])) and max(map(abs, row[1:4])) <= MAX_LENGTH_M:
             numbers.extend(row[:8] if sum(v * v for v in row[4:8]) > 0.5 else ())
     table = np.frombuffer(numbers).reshape(-1, 8).copy()
-    table[:, 0] = as_seconds(table[:, 0])[0]
+    table[:, 0] = as_seconds(table[:, 0])
     if not len(table):
         yield from repeat(None, len(times_s))
         return

@@ -106,7 +106,7 @@ def _of_rows(rows: list[_Row], header: str, columns: tuple[int, ...]) -> PoseLis
         return PoseList(_poses(rows, table), None, "positions and quaternions")
     euroc = first.commas and (float(np.nanmax(table[:, 0])) > _NANOSECONDS or count > 9) and not _w_is_last(header)
     poses = _poses(rows, table[:, [1, 2, 3, 5, 6, 7, 4] if euroc else slice(1, 8)])
-    return PoseList(poses, as_seconds(table[:, 0])[0], "EuRoC" if euroc else "TUM")
+    return PoseList(poses, as_seconds(table[:, 0]), "EuRoC" if euroc else "TUM")
 
 
 _COLUMNS = (7, 8, 9, 11, 12, 16, 17)

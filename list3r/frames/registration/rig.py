@@ -166,7 +166,9 @@ def build_rig(
     registration = None
     if depth_size is not None:
         if optics.depth_scale is None:
-            raise SourceError("the units of the depth images are unknown; give --depth-scale UNITS_PER_METRE")
+            raise SourceError(
+                "the units of the depth images are unknown; give --depth-scale UNITS_PER_METRE (1000: mm)"
+            )
         registration = _registration(optics, whole, camera, (depth_size, stored_size))
     scale, shared = optics.depth_scale or 1.0, _is_shared(optics)
     return Rig(
