@@ -32,7 +32,7 @@ from benchmarks.peers.point_maps import align_point_maps
 from benchmarks.peers.vggt_long import VggtLongSettings, robust_similarity
 from list3r.association.overlap.overlap_edge import EdgeEnd, measure_edge
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.core.geometry import Sim3, rotation_exp
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import frame_samples
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from list3r.evaluation.instances import match_boxes
 from list3r.frames.readers.aria import AriaSource
 from list3r.frames.source import SourceOptions
-from list3r.memory.masks import decode_mask
+from list3r.memory.core.masks import decode_mask
 from list3r.memory.store.store import Store
 
 Ints = NDArray[np.int64]

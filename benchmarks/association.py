@@ -260,7 +260,7 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, tr
 def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], descriptors: Any, joint: Any) -> None:
     """Store the chunks where VGGT-Long places them, with its loops as edges."""
     from benchmarks.peers.vggt_long import place
-    from list3r.memory.records import Edge
+    from list3r.memory.core.records import Edge
 
     placed, loops, _ = place(results, descriptors, joint)
     with store.transaction():
@@ -345,8 +345,8 @@ class _Truth:
 
     def _placed(self, samples: Any, frame: int) -> Any:
         """The similarity from a chunk to the truth, by its points within ten frames of one; None with too few."""
-        from list3r.memory.errors import DegenerateError
-        from list3r.memory.geometry import umeyama
+        from list3r.memory.core.errors import DegenerateError
+        from list3r.memory.core.geometry import umeyama
 
         video, near = self._video, np.abs(samples.frame - frame) <= 10
         index = samples.frame[near]
@@ -389,7 +389,7 @@ def _moved(S: Any, poses: Array) -> Array:
 
 def _points(store: Any) -> Array:
     """Points where the frames that saw them are, the bending of chunks undone."""
-    from list3r.memory.geometry import Sim3
+    from list3r.memory.core.geometry import Sim3
 
     parts, bends = [], store.bends.all()
     for chunk in store.chunks.all():

@@ -37,8 +37,8 @@ from list3r.catalog.records import (
     MemoryEntry,
     SpaceVectors,
 )
-from list3r.memory.description.words import kind_word
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.description.words import kind_word
+from list3r.memory.core.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from tests.postgres_server import PostgresServer, running_postgres
 

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.simulation.walks import HomeSessionWalk
 from list3r.evaluation.trajectory import Trajectory, associate, read_tum
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import write_walk
 from list3r.simulation.rendering.shading import EVENING

@@ -29,7 +29,7 @@ from list3r.association.revisits.all_keyframes import place_by_all_keyframes
 from list3r.association.revisits.session_edges import defer_session_edges
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.frames.base import Frame
-from list3r.memory.records import Edge, Keyframe
+from list3r.memory.core.records import Edge, Keyframe
 from list3r.reconstruction.keyframe_record import make_keyframes
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from list3r.simulation.rendering.render import Renderer

@@ -36,8 +36,8 @@ from list3r.api import open as open_memory
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import evaluate_scene, read_scene, relations_of_matches, scene_boxes
 from list3r.evaluation.trajectory import Trajectory, align, position_errors, read_tum, write_tum
-from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.masks import decode_mask
+from list3r.memory.core.geometry import Sim3, umeyama
+from list3r.memory.core.masks import decode_mask
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import DEPTH_UNITS_PER_M, WalkSettings, write_walk
 

@@ -31,8 +31,8 @@ from scale import write_memory
 import list3r
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.errors import List3rError
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import List3rError
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 

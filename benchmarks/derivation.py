@@ -27,10 +27,10 @@ import numpy as np
 from incremental import SEEN, SPACING_M, STEP, again, begin, chunk, place_of, user_s
 from machine import machine, write_json
 
-from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.core.geometry import Sim3, rotation_exp
+from list3r.memory.core.records import ChunkResult
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.maintenance import edits
-from list3r.memory.records import ChunkResult
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 
 WALKS = {"walk": ("rooms", 300), "stay": ("stay", 200), "sessions": ("rooms", 15), "corridor": ("corridor", 1000)}

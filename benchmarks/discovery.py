@@ -37,8 +37,8 @@ from list3r.instances.geometric.support import thin, without_fliers, without_rim
 from list3r.instances.geometric.views import ChunkViews, chunk_views, forget_views
 from list3r.instances.library import select_prompts
 from list3r.instances.settings import InstanceSettings, MaskTrackSettings
-from list3r.memory.geometry import OrientedBox, Sim3, upright_box
-from list3r.memory.relations.instance_geometry import fit_box, without_strays
+from list3r.memory.core.geometry import OrientedBox, Sim3, upright_box
+from list3r.memory.library.relations.instance_geometry import fit_box, without_strays
 from list3r.reconstruction.base import Reconstruction, backproject
 from training.samples import chunk_settings
 from training.swept import swept

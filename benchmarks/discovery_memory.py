@@ -31,7 +31,7 @@ from list3r.api import open as open_memory
 from list3r.evaluation.instances import match_boxes
 from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
 from list3r.evaluation.trajectory import Trajectory, read_tum, write_tum
-from list3r.memory.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.geometry import quat_wxyz_from_rotation
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import DEPTH_UNITS_PER_M, frame_name
 from training.worlds.film import Film, FilmSettings, make_film, reconstruction_of

@@ -26,8 +26,8 @@ from machine import STARTED_AT, write_json
 from PIL import Image
 
 from list3r.exporters.registry import FORMATS
-from list3r.memory.geometry import OrientedBox, Sim3
-from list3r.memory.records import (
+from list3r.memory.core.geometry import OrientedBox, Sim3
+from list3r.memory.core.records import (
     ChunkResult,
     FrameSamples,
     Instance,

@@ -27,9 +27,9 @@ from benchmarks.simulation.video import SimulatedVideo
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, measure_edge
 from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, rotation_log, umeyama
-from list3r.memory.records import ChunkResult
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3, rotation_log, umeyama
+from list3r.memory.core.records import ChunkResult
 
 Array = NDArray[np.float64]
 

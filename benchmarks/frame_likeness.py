@@ -67,7 +67,7 @@ def simulated(preset: str, seed: int) -> dict[str, Any]:
 def masks(video: Any, model: Any) -> dict[str, Any]:
     """Scores of the simulated masks of the first chunk, by pixels of all its frames."""
     from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-    from list3r.memory.masks import decode_mask
+    from list3r.memory.core.masks import decode_mask
 
     span = plan_chunks(len(video.time_s), ChunkSettings(), ())[0]
     library = model.chunk(span).library

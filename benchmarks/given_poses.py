@@ -48,7 +48,7 @@ from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene, sc
 from list3r.evaluation.trajectory import Trajectory, associate, evaluate_trajectory, read_tum
 from list3r.exporters.components import read_components
 from list3r.frames.recordings.axes import arkit_of_pose
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.walk import PathSettings
 

@@ -33,9 +33,17 @@ from typing import Any
 import numpy as np
 from machine import machine, write_json
 
+from list3r.memory.core.records import (
+    ChunkResult,
+    FrameSamples,
+    Keyframe,
+    LocalInstance,
+    LocalLibrary,
+    MaskTrack,
+    Support,
+)
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.maintenance import edits
-from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from list3r.pipeline import mapping
 

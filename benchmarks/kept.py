@@ -20,7 +20,7 @@ import numpy as np
 
 from list3r.cli import main
 from list3r.frames.base import Camera, Frame
-from list3r.memory.records import ChunkResult
+from list3r.memory.core.records import ChunkResult
 from list3r.pipeline import session as session_stage
 from list3r.pipeline.chunks import chunk as chunk_stage
 from list3r.reconstruction.base import Around, DepthNoise, PosedOnly, Reconstruction, Reconstructor

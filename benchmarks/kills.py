@@ -20,9 +20,9 @@ from typing import Any
 from machine import descendants
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import MergeDecision, Relation
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.records import MergeDecision, Relation
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
@@ -274,8 +274,8 @@ def _say(number: int) -> None:
 
 def edit_for_ever(path: str, seed: int) -> None:
     """Edit as an operator does, and say the number of each entry once it is committed."""
-    from list3r.memory.errors import List3rError
-    from list3r.memory.maintenance import edits
+    from list3r.memory.core.errors import List3rError
+    from list3r.memory.library.maintenance import edits
 
     rng = random.Random(seed)
     with Store.open(path, writable=True) as store:

@@ -22,7 +22,7 @@ from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory
 from list3r.frames.base import Frame, guessed_camera
 from list3r.frames.options import parse_distortion, parse_intrinsics
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import TrackingError
+from list3r.memory.core.errors import TrackingError
 from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.sfm.frame_poses import PosedSegment

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera, Frame
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.frames.source import open_source
-from list3r.memory.errors import SourceError, TrackingError
+from list3r.memory.core.errors import SourceError, TrackingError
 from list3r.reconstruction.poses import angle_deg
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from training.worlds.film import FilmSettings, frames_of, make_film

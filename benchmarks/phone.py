@@ -33,9 +33,9 @@ from machine import write_json
 from numpy.typing import NDArray
 
 from list3r.api import open as open_memory
-from list3r.memory.geometry import umeyama
+from list3r.memory.core.geometry import umeyama
+from list3r.memory.library.world.guess import GUESS
 from list3r.memory.store.store import Store
-from list3r.memory.world.guess import GUESS
 from list3r.pipeline.filming import film_advice
 from list3r.pipeline.finishing import guess_anew
 from list3r.pipeline.mapping import finish_session

@@ -29,8 +29,8 @@ from list3r.association.graph.incremental import extend
 from list3r.association.graph.marginals import marginals
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.graph.solver import GraphProblem
-from list3r.memory.geometry import Sim3, stack, take, umeyama
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3, stack, take, umeyama
+from list3r.memory.core.records import Edge
 
 Array = NDArray[np.float64]
 

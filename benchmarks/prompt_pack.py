@@ -24,8 +24,8 @@ from machine import write_json
 import list3r
 from list3r.api import SceneMemory
 from list3r.exporters.prompt.scene_text import SUPPORTING, name_of
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import Instance, Relation
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import Instance, Relation
 from list3r.memory.store.store import Store
 
 BUDGETS = (300, 1000, 4000)

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 import list3r
 from list3r.importers.base import box_surface
 from list3r.importers.importing import import_map
-from list3r.memory.errors import List3rError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.errors import List3rError
+from list3r.memory.core.geometry import OrientedBox
 
 Array = NDArray[np.float64]
 SETS = Path(__file__).parent / "question_sets"

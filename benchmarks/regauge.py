@@ -24,8 +24,8 @@ from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory
 from list3r.frames.base import Frame
 from list3r.frames.chunking.chunks import plan_chunks
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalInstance
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalInstance
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.mapping import add_chunk, finish_session

@@ -202,7 +202,7 @@ def _placed(store: Any, chunk_id: int, believed: list[Any]) -> dict[int, Any]:
 
 def to_truth(video: Any, samples: Any) -> Any:
     """The similarity that lays a chunk's samples on the world best."""
-    from list3r.memory.geometry import umeyama
+    from list3r.memory.core.geometry import umeyama
 
     row, column = np.divmod(samples.pixel, video.camera.width)
     known = video.depth[samples.frame, row, column] > 0

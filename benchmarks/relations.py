@@ -36,7 +36,7 @@ from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.views import chunk_views
 from list3r.instances.neural.candidates import plane_of_mask, without_spill
 from list3r.instances.settings import FEATURE_SPACE, InstanceSettings
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.geometry import OrientedBox
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.mapping import add_chunk, finish_session
@@ -197,7 +197,7 @@ def _ids(walk: Path, index: int) -> np.ndarray:
 
 def _true_id(walk: Path, track: Any) -> int:
     """The object that most of a track's masks are on."""
-    from list3r.memory.masks import decode_mask
+    from list3r.memory.core.masks import decode_mask
 
     votes: Counter[int] = Counter()
     for row in range(0, len(track.frames), 5):

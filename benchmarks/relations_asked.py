@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from list3r.memory.records import Instance, Relation
+from list3r.memory.core.records import Instance, Relation
 from list3r.memory.store.store import Store
 from list3r.queries.relations import noise_of, viewer_from
 from list3r.queries.views.viewpoint import Viewpoint, between, viewed

@@ -34,8 +34,8 @@ from typing import Any
 from machine import machine, write_json
 
 from list3r.cli.app import run
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.log_mark import Log
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
@@ -54,8 +54,8 @@ _FIXED = ("chunks", "frames", "local_instances", "supports", "observations")
 """What no label changes."""
 _KILLED_WRITER = """
 import sys
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.log_mark import Log
 from list3r.memory.store.store import Store
 store = Store.open(sys.argv[1], writable=True)

@@ -29,9 +29,9 @@ from kills import build_command, kill_builds, kill_commands, kill_edits, kill_up
 from machine import end_with_parent, machine, write_json
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.errors import List3rError, MemoryFileError
-from list3r.memory.maintenance.repair import repair
-from list3r.memory.records import Observation, Relation
+from list3r.memory.core.errors import List3rError, MemoryFileError
+from list3r.memory.core.records import Observation, Relation
+from list3r.memory.library.maintenance.repair import repair
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store

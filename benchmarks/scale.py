@@ -28,8 +28,8 @@ import numpy as np
 from machine import machine, write_json
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import Instance, Relation
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import Instance, Relation
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.nearest import nearest

@@ -31,8 +31,8 @@ from benchmarks.simulation.changes import random_changes
 from benchmarks.simulation.walks import ChangedWalk
 from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
 from list3r.evaluation.trajectory import Trajectory, read_tum
-from list3r.memory.geometry import OrientedBox, Sim3
-from list3r.memory.records import ChangeEvent
+from list3r.memory.core.geometry import OrientedBox, Sim3
+from list3r.memory.core.records import ChangeEvent
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.walk import camera_path

@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from list3r.memory.errors import List3rError
+from list3r.memory.core.errors import List3rError
 
 _PLACES = (
     ("list3r.pipeline.mapping", "measure_edge"),

@@ -33,7 +33,7 @@ from machine import write_json
 
 from list3r.catalog import Catalog
 from list3r.memory.store.store import Store
-from list3r.service.tokens import make_token
+from list3r.server.http.tokens import make_token
 from tests.conftest import write_small_room
 
 SECRET = "a secret of the benchmark, long enough"

@@ -107,7 +107,7 @@ class Truth:
 
     def _chunk_from_truth(self, samples: Any) -> Any:
         """The similarity from the truth to a chunk by all that the chunk saw and that is still, trimmed."""
-        from list3r.memory.geometry import umeyama
+        from list3r.memory.core.geometry import umeyama
 
         video = self._video
         row, column = np.divmod(samples.pixel, video.camera.width)
@@ -123,7 +123,7 @@ class Truth:
         return found
 
     def _ate(self, store: Any) -> float:
-        from list3r.memory.geometry import umeyama
+        from list3r.memory.core.geometry import umeyama
 
         placed = store.trajectory.poses()
         estimate = np.stack([S.translation for _, S in placed])
@@ -134,7 +134,7 @@ class Truth:
 
 def _compared(chunk: Any, center: Array, true_center_world: Array) -> dict[str, float]:
     """Error of a point of a chunk by its stated covariance, lengths in chunk units."""
-    from list3r.memory.geometry import skew
+    from list3r.memory.core.geometry import skew
 
     error = chunk.S_world_chunk.inverse().apply(true_center_world[None])[0] - center
     by_tangent = np.concatenate([np.eye(3), -skew(center), center[:, None]], axis=1)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from list3r.api import SceneMemory, build, open, update
     from list3r.frames.options import SourceOptions
-    from list3r.memory.errors import List3rError
+    from list3r.memory.core.errors import List3rError
     from list3r.pipeline.request import BuildRequest
     from list3r.pipeline.settings import BuildSettings
 
@@ -38,7 +38,7 @@ _HOMES = {
     "BuildRequest": "list3r.pipeline.request",
     "BuildSettings": "list3r.pipeline.settings",
     "SourceOptions": "list3r.frames.options",
-    "List3rError": "list3r.memory.errors",
+    "List3rError": "list3r.memory.core.errors",
     "SceneMemory": "list3r.api",
     "build": "list3r.api",
     "open": "list3r.api",

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Un
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import List3rError, OptionError, check_share, naming_extras
-from list3r.memory.maintenance.editing import MemoryEdits
+from list3r.memory.core.errors import List3rError, OptionError, check_share, naming_extras
+from list3r.memory.library.maintenance.editing import MemoryEdits
+from list3r.memory.library.world.scale import Lengths, lengths_of
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import Lengths, lengths_of
 
 if TYPE_CHECKING:
     import networkx
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from list3r.exporters.registry import ExportOptions
     from list3r.exporters.tables import Table, Value
     from list3r.frames.options import SourceOptions
-    from list3r.memory.geometry import Sim3
-    from list3r.memory.records import FrameRow, Instance, Relation, Session, Support
+    from list3r.memory.core.geometry import Sim3
+    from list3r.memory.core.records import FrameRow, Instance, Relation, Session, Support
     from list3r.pipeline.request import BuildRequest, RunArguments
     from list3r.pipeline.settings import BuildSettings
     from list3r.queries.changes import Changed
@@ -83,10 +83,10 @@ def open(
         raise OptionError(f"{path} {which} can only be read")
     with Store.open(path) as store:
         if at is not None:
-            from list3r.memory.maintenance.as_of import store_at
+            from list3r.memory.library.maintenance.as_of import store_at
 
             return SceneMemory(store_at(store, at))
-        from list3r.memory.maintenance.with_scraps import store_with_scraps
+        from list3r.memory.library.maintenance.with_scraps import store_with_scraps
 
         return SceneMemory(store_with_scraps(store, min_confidence or 0.0))
 
@@ -516,14 +516,14 @@ class SceneMemory(MemoryEdits):
     @_alone
     def relation_graph(self) -> networkx.MultiDiGraph:
         """Return instances and relations as a graph."""
-        from list3r.memory.search.graphs import relation_graph
+        from list3r.memory.store.search.graphs import relation_graph
 
         return relation_graph(self.store)
 
     @_alone
     def merge_graph(self) -> networkx.Graph:
         """Return local instances, and the decisions that joined them, as a graph."""
-        from list3r.memory.search.graphs import merge_graph
+        from list3r.memory.store.search.graphs import merge_graph
 
         return merge_graph(self.store)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 Float = NDArray[np.float32]
 

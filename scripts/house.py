@@ -19,15 +19,9 @@ PACKAGE = "list3r"
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 BLOCKS = (ast.If, ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Try, ast.Match, *Function.__args__)
 BUDGETS = {
-    "memory core": (1000, ("memory/*.py", "memory/core")),
-    "memory store": (3500, ("memory/store", "memory/search", "memory/maintenance")),
-    "memory library": (
-        7500,
-        (
-            *("memory/change", "memory/description", "memory/library", "memory/merging"),
-            *("memory/overlap", "memory/relations", "memory/world"),
-        ),
-    ),
+    "memory core": (1000, ("memory/core",)),
+    "memory store": (3500, ("memory/store",)),
+    "memory library": (7500, ("memory/library",)),
     "queries": (3000, ("queries",)),
     "association": (7000, ("association",)),
     "reconstruction": (10000, ("reconstruction",)),

@@ -14,7 +14,7 @@ import csv
 from pathlib import Path
 
 HAND = Path(__file__).with_name("nouns.psv")
-OUT = Path(__file__).parent.parent / "list3r/memory/description/nouns.tsv"
+OUT = Path(__file__).parent.parent / "list3r/memory/core/description/nouns.tsv"
 _LEXICAL_FILES = {"05", "06", "10", "13", "18", "20"}
 """Animals, artifacts, what is read, food, persons, plants."""
 _NOT_MEANT = frozenset(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.masks import encode_mask
-from list3r.memory.records import FrameSamples, LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.masks import encode_mask
+from list3r.memory.core.records import FrameSamples, LocalInstance, LocalLibrary, MaskTrack, Support
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 WALL, FLOOR, BOX, MOVER = 0, 1, 2, 3

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import settings
 from PIL import Image
 
-from list3r.memory.geometry import OrientedBox, Sim3
-from list3r.memory.records import (
+from list3r.memory.core.geometry import OrientedBox, Sim3
+from list3r.memory.core.records import (
     BestView,
     ChunkResult,
     FrameSamples,

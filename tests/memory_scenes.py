@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from list3r.memory.constraints import Constraints
-from list3r.memory.geometry import Sim3
-from list3r.memory.merging.edges import Key, MergeSettings, form_groups, links_of, pair_scores
-from list3r.memory.merging.nodes import Nodes
-from list3r.memory.overlap.pair_scores import Numbering, PairTable
-from list3r.memory.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes
-from list3r.memory.records import MergeDecision, Support
+from list3r.memory.core.constraints import Constraints
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import MergeDecision, Support
+from list3r.memory.library.merging.edges import Key, MergeSettings, form_groups, links_of, pair_scores
+from list3r.memory.library.merging.nodes import Nodes
+from list3r.memory.library.overlap.pair_scores import Numbering, PairTable
+from list3r.memory.library.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes
 from list3r.memory.store.tables.local_instances import LocalNode
 
 IMAGE = (480, 640)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 SPANS = ((0, 60), (30, 90), (60, 120), (90, 150), (120, 180), (150, 210))
 """Chunks of 60 frames that share 30."""

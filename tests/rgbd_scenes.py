@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.core.geometry import rotation_exp
 from list3r.reconstruction.base import SensorNoise
 
 CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.memory.geometry import Array, Sim3
-from list3r.memory.masks import encode_mask
-from list3r.memory.records import (
+from list3r.memory.core.geometry import Array, Sim3
+from list3r.memory.core.masks import encode_mask
+from list3r.memory.core.records import (
     ChunkResult,
     FrameSamples,
     Keyframe,

@@ -21,8 +21,8 @@ from list3r.association.revisits.chunk_agreement import (
 )
 from list3r.association.revisits.session_edges import defer_session_edges
 from list3r.association.revisits.verification import VerificationSettings
-from list3r.memory.geometry import Array, Sim3
-from list3r.memory.records import Edge, Keyframe
+from list3r.memory.core.geometry import Array, Sim3
+from list3r.memory.core.records import Edge, Keyframe
 from tests.session_scenes import FOCAL, Box, cast
 
 GREY = (128, 128, 128)

@@ -8,8 +8,8 @@ from scipy.stats import chi2
 
 from benchmarks.peers.point_maps import align_point_maps
 from list3r.association.overlap.alignment import Alignment, align
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
 
 S_V_U = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.0])
 S_V_U_SCALED = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.35])

@@ -23,8 +23,8 @@ from list3r.association.revisits.constellations.surface_fit import (
 from list3r.association.revisits.cross_check import Side
 from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3, rotation_exp
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.geometry import Sim3, rotation_exp
+from list3r.memory.core.records import FrameSamples
 
 
 def constellation(seed: int, count: int = 9) -> Constellation:

@@ -12,9 +12,9 @@ import pytest
 
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, MeasuredEdge, measure_edge
 from list3r.instances.overlays import draw_support, write_support
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples
 from tests.association_scenes import BOXES, CAMERA, MOVER, Thing, film
 
 S_U = Sim3.exp([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, 0.4])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from list3r.association.graph.pose_graph import contradicted, optimize
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge
 
 
 def circle(count: int) -> list[Sim3]:

@@ -18,8 +18,8 @@ from list3r.association.revisits.instance_similarity import (
     loop_score,
 )
 from list3r.association.revisits.joint_window import Place, composed_covariance, joint_edge
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples, JointWindow
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples, JointWindow
 from tests.association_scenes import CAMERA, film
 
 GAUGE_U = Sim3.exp([0.5, -0.2, 1.0, 0.3, -0.5, 0.2, 0.4])

@@ -12,8 +12,8 @@ from list3r.association.overlap.motion import flag_dynamic, motion_track, seen_t
 from list3r.frames.base import Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.library import build_library
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples, LocalLibrary
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples, LocalLibrary
 from list3r.reconstruction.keyframe_record import frame_samples
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from tests.association_scenes import BOX, BOXES, CAMERA, MOVER, Thing, film, library_of

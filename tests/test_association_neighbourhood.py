@@ -13,8 +13,8 @@ from list3r.association.revisits.constellations.neighbourhood import Neighbour, 
 from list3r.association.revisits.cross_check import Side
 from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3, rotation_exp
-from list3r.memory.records import FrameSamples, Support
+from list3r.memory.core.geometry import Sim3, rotation_exp
+from list3r.memory.core.records import FrameSamples, Support
 from list3r.memory.store.tables.local_instances import LocalNode
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)

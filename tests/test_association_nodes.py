@@ -14,9 +14,9 @@ from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.overlap.overlap_edge import EdgeEnd, measure_edge
-from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.core.bends import Bend
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples
 from list3r.memory.store.store import Store
 from tests.association_scenes import CAMERA, film, walk
 
@@ -69,7 +69,7 @@ def _stretch(samples: FrameSamples, frame: int) -> float:
 
 def error(samples: dict[int, FrameSamples], graph: GraphResult, bends: dict[int, Bend]) -> float:
     """RMS distance of all cameras from the truth after Sim(3), metres."""
-    from list3r.memory.geometry import umeyama
+    from list3r.memory.core.geometry import umeyama
 
     found, true = [], []
     for k, s in samples.items():

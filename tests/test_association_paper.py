@@ -21,8 +21,8 @@ from list3r.association.revisits.instance_similarity import (
     loop_score,
 )
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge
 
 
 def test_s_loop_weighs_frames_against_instances() -> None:

@@ -15,9 +15,9 @@ from list3r.association.graph.edge_trust import Tree, chain_squares
 from list3r.association.graph.incremental import extend
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings, optimize
 from list3r.association.graph.solver import GraphProblem, adjoint
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, skew, stack, take
-from list3r.memory.records import Edge
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3, skew, stack, take
+from list3r.memory.core.records import Edge
 
 UNIT = np.array([1.5] * 3 + [1.0] * 4)
 

@@ -17,8 +17,8 @@ from list3r.association.revisits.frame_search import TRAINED, SearchSettings, ch
 from list3r.association.revisits.scaled_verification import _fit, _similarities, verify_scaled
 from list3r.association.revisits.search import RevisitSettings, find_loops
 from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, Edge, FrameSamples, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow, Edge, FrameSamples, Keyframe
 from list3r.memory.store.derived import Derived
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.local import match, relative_pose

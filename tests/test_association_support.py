@@ -13,9 +13,9 @@ from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confid
 from list3r.association.overlap.shared_points import Pairs, shared_pairs, shared_samples
 from list3r.association.overlap.support import static_support
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.masks import encode_mask
-from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.masks import encode_mask
+from list3r.memory.core.records import LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import frame_samples
 from list3r.reconstruction.settings import SampleSettings

@@ -11,8 +11,8 @@ from list3r.association.graph.node_graph import bend_chunks
 from list3r.association.graph.pose_graph import optimize
 from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.overlap.camera_edge import camera_edge
-from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.core.geometry import Sim3, umeyama
+from list3r.memory.core.records import Edge, FrameSamples
 from list3r.reconstruction.scale_loss import lost_scale
 
 TURN = (60, 80)

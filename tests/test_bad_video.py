@@ -20,8 +20,8 @@ from list3r.frames.chunking.borrowing import BorrowSettings, borrow
 from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.frames.decoding.picture import small_gray
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import SourceError, TrackingError
-from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.memory.core.errors import SourceError, TrackingError
+from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
 from list3r.pipeline.chunks.calibration import camera_notes

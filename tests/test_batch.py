@@ -24,7 +24,7 @@ from list3r.batch.tasks import Asked, BatchTask, read_tasks
 from list3r.batch.work import BatchJob, Outcome, run_task
 from list3r.cli.app import run as list3r
 from list3r.cli.build.source_options import SourceArguments
-from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
+from list3r.memory.core.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
 from list3r.pipeline.request import BuildRequest, RunOptions

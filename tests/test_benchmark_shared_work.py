@@ -10,7 +10,7 @@ import pytest
 from benchmarks.shared_work import SharedWork, digest
 from list3r.association.overlap.alignment import AlignmentSettings
 from list3r.association.revisits import joint_window
-from list3r.memory.errors import DegenerateError
+from list3r.memory.core.errors import DegenerateError
 
 
 @dataclass(frozen=True)

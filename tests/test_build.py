@@ -16,7 +16,7 @@ import pytest
 import list3r
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.simulation.dataset import WalkSettings, write_walk
 from tests.program import in_process, with_signals

@@ -30,9 +30,9 @@ from list3r.catalog.records import (
     SpaceVectors,
 )
 from list3r.cli.app import run as list3r
-from list3r.memory.description.words import vocabulary
-from list3r.memory.errors import List3rError, OptionError, SpaceMismatchError, UnknownIdError
-from list3r.memory.geometry import OrientedBox, rotation_exp
+from list3r.memory.core.description.words import vocabulary
+from list3r.memory.core.errors import List3rError, OptionError, SpaceMismatchError, UnknownIdError
+from list3r.memory.core.geometry import OrientedBox, rotation_exp
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 from tests.postgres_server import Network, PostgresServer, running_postgres

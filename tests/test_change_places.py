@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from list3r.memory.change.free_space_carving import FreeSpaceCarving
-from list3r.memory.change.places import Places
-from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.core.geometry import Sim3, rotation_exp
+from list3r.memory.core.records import Edge
+from list3r.memory.library.change.free_space_carving import FreeSpaceCarving
+from list3r.memory.library.change.places import Places
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.merging.edges import pair_scores
-from list3r.memory.overlap.summaries import chunk_summaries
-from list3r.memory.overlap.visibility import (
+from list3r.memory.library.merging.edges import pair_scores
+from list3r.memory.library.overlap.summaries import chunk_summaries
+from list3r.memory.library.overlap.visibility import (
     UNTOLD,
     DepthView,
     VisibilitySettings,
@@ -25,7 +26,6 @@ from list3r.memory.overlap.visibility import (
     seen_through_share,
     tally,
 )
-from list3r.memory.records import Edge
 from list3r.memory.store.store import Store
 from tests.session_scenes import ROOM, Box, add_session, cameras, cast, place_together, simulated_chunk
 

@@ -12,8 +12,8 @@ from list3r.instances.carving.carved_instances import _Change, add_changed_place
 from list3r.instances.carving.carved_surfaces import ChangedPlaceSettings
 from list3r.instances.geometric.features import object_feature
 from list3r.instances.settings import FEATURE_SPACE
+from list3r.memory.core.records import LocalLibrary
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.records import LocalLibrary
 from list3r.memory.store.store import Store
 from tests import session_scenes
 from tests.session_scenes import ROOM, Box, cameras, place_together

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Array, Sim3
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Array, Sim3
+from list3r.memory.core.records import ChangeEvent
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.maintenance.history import world_at
-from list3r.memory.overlap.visibility import DepthView, place_visibility
-from list3r.memory.records import ChangeEvent
+from list3r.memory.library.maintenance.history import world_at
+from list3r.memory.library.overlap.visibility import DepthView, place_visibility
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 
@@ -67,7 +67,7 @@ def test_an_edge_beside_the_place_is_not_free_space() -> None:
 
 
 def _event(kind: str, session: int, instance: int, moved: float = 1.0) -> ChangeEvent:
-    from list3r.memory.geometry import OrientedBox
+    from list3r.memory.core.geometry import OrientedBox
 
     here, there = (OrientedBox(np.array([x, 0.0, 0.0]), np.full(3, 0.1), np.eye(3)) for x in (0.0, moved))
     before, after = {"added": (None, there), "removed": (here, None)}.get(kind, (here, there))

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.maintenance.history import world_at
-from list3r.memory.records import ChangeEvent
+from list3r.memory.core.records import ChangeEvent
+from list3r.memory.library.maintenance.history import world_at
 from list3r.memory.store.store import Store
 from tests.session_scenes import Box, metric_store
 from tests.test_derived_sessions import APART_M, film, house, moved

@@ -19,7 +19,7 @@ import list3r
 from list3r.cli.app import GROUPS, MODULES, commands
 from list3r.exporters.registry import FORMATS
 from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
-from list3r.memory.records import Relation
+from list3r.memory.core.records import Relation
 from list3r.memory.store.store import Store
 from list3r.models.presets import PRESETS
 from tests.conftest import write_small_room

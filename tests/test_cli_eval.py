@@ -17,8 +17,8 @@ from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Frame
 from list3r.frames.folder import FolderSource
 from list3r.frames.source import open_source
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge
 from list3r.memory.store.store import Store
 from tests.conftest import chunk_result, write_small_room
 from tests.program import in_process as run

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
-from list3r.memory.masks import decode_mask, encode_mask
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.masks import decode_mask, encode_mask
 from list3r.memory.store.rows.codec import dequantise, pack, pack_sim3, quantise, raw_array, unpack, unpack_sim3
 
 

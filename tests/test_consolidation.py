@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import UnknownIdError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import UnknownIdError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary
 from list3r.memory.library.consolidation import ConsolidationReport, consolidate
 from list3r.memory.library.identities import assign_ids
+from list3r.memory.library.relations.settings import RelationSettings
 from list3r.memory.library.rules import WORLD, ConsolidationSettings, settings_of
-from list3r.memory.records import ChunkResult, FrameSamples, LocalInstance, LocalLibrary
-from list3r.memory.relations.settings import RelationSettings
-from list3r.memory.search.graphs import merge_graph, relation_graph
+from list3r.memory.store.search.graphs import merge_graph, relation_graph
 from list3r.memory.store.store import Store
 from tests.conftest import chunk_result, local_instance
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, Piece, surface

@@ -11,15 +11,15 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, LocalLibrary, Votes
 from list3r.memory.library import attaching, consolidation, relating
 from list3r.memory.library.consolidation import ConsolidationReport, consolidate
 from list3r.memory.library.labels import apply_labels, put_votes
+from list3r.memory.library.maintenance import edits
+from list3r.memory.library.overlap import summaries, voxels
+from list3r.memory.library.overlap.summaries import is_known, world_unit
 from list3r.memory.library.rules import WORLD, ConsolidationSettings, RedundancySettings
-from list3r.memory.maintenance import edits
-from list3r.memory.overlap import summaries, voxels
-from list3r.memory.overlap.summaries import is_known, world_unit
-from list3r.memory.records import ChunkResult, LocalLibrary, Votes
 from list3r.memory.store.store import Store
 
 ORDERS = {

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r.memory.overlap.summaries import SummaryCache, sample_of
+from list3r.memory.library.overlap.summaries import SummaryCache, sample_of
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
 

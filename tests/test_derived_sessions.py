@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.maintenance import edits
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from tests.session_scenes import FRAMES, Box, cameras, metric_store, simulated_chunk
 from tests.test_derivation import check, tables

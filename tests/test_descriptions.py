@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.memory.description.colors import (
+from list3r.memory.core.description.colors import (
     Reference,
     color_name,
     color_names,
@@ -15,7 +15,7 @@ from list3r.memory.description.colors import (
     main_color,
     scene_reference,
 )
-from list3r.memory.description.describe import describe, shape_word
+from list3r.memory.core.description.describe import describe, shape_word
 
 NAMED = {
     (245, 245, 245): "white",

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from list3r.cli.app import run
-from list3r.memory.description.coco import COCO_80, SIZES_M, plausible
-from list3r.memory.errors import OptionError
+from list3r.memory.core.description.coco import COCO_80, SIZES_M, plausible
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Votes
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import LabelSettings, apply_labels, decide, put_votes, votes_of_names
-from list3r.memory.maintenance import edits
-from list3r.memory.records import Votes
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from list3r.semantics.detection import detect
 from list3r.semantics.detector import Detections

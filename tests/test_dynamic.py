@@ -13,8 +13,8 @@ import pytest
 import list3r
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict, scene_schema
+from list3r.memory.core.records import Instance, LocalInstance, LocalLibrary, MotionTrack
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.records import Instance, LocalInstance, LocalLibrary, MotionTrack
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, local_instance
 

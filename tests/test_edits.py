@@ -10,11 +10,11 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.constraints import Key
-from list3r.memory.errors import List3rError, MemoryFileError, OptionError, UnknownIdError
-from list3r.memory.geometry import Sim3
-from list3r.memory.maintenance import edits
-from list3r.memory.maintenance.merge_log import merge_log
+from list3r.memory.core.constraints import Key
+from list3r.memory.core.errors import List3rError, MemoryFileError, OptionError, UnknownIdError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.library.maintenance import edits
+from list3r.memory.library.maintenance.merge_log import merge_log
 from list3r.memory.store.store import Store
 from tests.conftest import instance
 from tests.memory_scenes import CHAIR, MUG, TABLE, TWIN

@@ -16,8 +16,8 @@ from tests.test_edits import built
 
 EDITOR = """
 import sys
-from list3r.memory.maintenance import edits
-from list3r.memory.constraints import standing
+from list3r.memory.library.maintenance import edits
+from list3r.memory.core.constraints import standing
 from list3r.memory.store.store import Store
 
 store = Store.open(sys.argv[1], writable=True)

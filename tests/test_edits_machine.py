@@ -15,10 +15,10 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from list3r.memory.constraints import Key
-from list3r.memory.errors import UnknownIdError
+from list3r.memory.core.constraints import Key
+from list3r.memory.core.errors import UnknownIdError
 from list3r.memory.library import consolidation
-from list3r.memory.maintenance import edits
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from tests.conftest import THOROUGH
 from tests.memory_scenes import BOX, MUG, TWIN

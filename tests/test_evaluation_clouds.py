@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from list3r.evaluation.cloud import cloud_distances, evaluate_cloud
 from list3r.evaluation.icp import IcpSettings, register
 from list3r.evaluation.point_clouds import PointCloud, estimate_normals, read_cloud, thinned
-from list3r.memory.errors import DegenerateError, OptionError, SourceError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError, OptionError, SourceError
+from list3r.memory.core.geometry import Sim3
 
 
 def room(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,8 @@ from list3r.evaluation.covisibility import (
     write_covisibility,
 )
 from list3r.frames.base import Camera
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.geometry import rotation_exp
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 

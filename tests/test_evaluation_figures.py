@@ -22,8 +22,8 @@ from list3r.evaluation.figures import (
 )
 from list3r.evaluation.revisits import Candidates, judge
 from list3r.evaluation.trajectory import Trajectory
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import OrientedBox, rotation_exp
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import OrientedBox, rotation_exp
 
 
 def looking(up: tuple[float, float, float], count: int = 30) -> np.ndarray:

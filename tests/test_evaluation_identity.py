@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from list3r.evaluation.identity import evaluate_identities
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 LABELS = np.zeros((6, 8), int)
 LABELS[:3, :4], LABELS[3:, 4:] = 1, 2

@@ -23,9 +23,9 @@ from list3r.evaluation.revisits import (
     recall_at_precision,
     score,
 )
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge
 
 SPANS = {1: (0, 9), 2: (8, 17), 3: (16, 23), 4: (22, 33)}
 

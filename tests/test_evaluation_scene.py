@@ -17,8 +17,8 @@ from list3r.evaluation.instances import evaluate_instances, match_boxes
 from list3r.evaluation.relations import evaluate_relations
 from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
 from list3r.evaluation.trajectory import Trajectory
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.geometry import OrientedBox, Sim3, quat_wxyz_from_rotation, rotation_exp
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.geometry import OrientedBox, Sim3, quat_wxyz_from_rotation, rotation_exp
 
 
 def box(x: float, y: float, z: float, size: tuple[float, float, float], yaw_deg: float = 0.0) -> OrientedBox:

@@ -19,8 +19,8 @@ from list3r.evaluation.trajectory import (
     read_tum,
     write_tum,
 )
-from list3r.memory.errors import DegenerateError, OptionError, SourceError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError, OptionError, SourceError
+from list3r.memory.core.geometry import Sim3
 
 
 def random_walk(seed: int, count: int = 80) -> Trajectory:

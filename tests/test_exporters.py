@@ -15,9 +15,9 @@ from list3r.api import SceneMemory
 from list3r.exporters.palette import instance_color, linear_from_srgb, srgb_from_linear
 from list3r.exporters.registry import FORMATS, find_format
 from list3r.exporters.registry import export as export_memory
-from list3r.memory.errors import ExportError, MemoryFileError, OptionError
-from list3r.memory.geometry import OrientedBox, Sim3
-from list3r.memory.records import Instance, Observation, Relation
+from list3r.memory.core.errors import ExportError, MemoryFileError, OptionError
+from list3r.memory.core.geometry import OrientedBox, Sim3
+from list3r.memory.core.records import Instance, Observation, Relation
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, instance, local_instance
 

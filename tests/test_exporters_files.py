@@ -21,8 +21,8 @@ from list3r.exporters.palette import instance_color
 from list3r.exporters.ply import PlySettings, write_ply
 from list3r.exporters.tables import records_of
 from list3r.exporters.tum import write_tum
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3
 from list3r.memory.store.store import Store
 from tests.browser import PROGRAM, Browser
 from tests.test_exporters import write_split_memory

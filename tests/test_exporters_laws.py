@@ -18,9 +18,9 @@ import pytest
 import list3r
 from list3r.api import SceneMemory
 from list3r.exporters.registry import FORMATS
-from list3r.memory.errors import ExportError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Observation
+from list3r.memory.core.errors import ExportError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Observation
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, instance, local_instance, small_picture
 from tests.test_exporters import installed
@@ -209,7 +209,7 @@ import resource, shutil, sys
 from pathlib import Path
 import list3r
 from list3r.exporters.registry import FORMATS
-from list3r.memory.errors import ExportError
+from list3r.memory.core.errors import ExportError
 folder = Path(sys.argv[2])
 with list3r.open(sys.argv[1]) as memory:
     for name in sys.argv[3:]:

@@ -13,9 +13,9 @@ import list3r
 from list3r.cli.app import run
 from list3r.exporters.meshes.closed import ClosedSurface, divided, hull, slab, zero_level
 from list3r.exporters.meshes.instance_mesh import instance_mesh
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Observation
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Observation
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, instance, local_instance, write_small_room
 

@@ -20,7 +20,7 @@ from list3r.exporters.palette import instance_color
 from list3r.exporters.plan.drawing import PlanSettings, draw_grid, footprints, plan_figure, write_plan
 from list3r.exporters.plan.view import PlanView, choose_rotation, choose_view
 from list3r.exporters.tags import TagTarget, crossings, place_tags
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
 from tests.test_exporters import write_split_memory
 

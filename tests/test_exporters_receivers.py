@@ -19,7 +19,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.exporters.cameras.pictures import jpeg_size
 from list3r.frames.source import open_source
-from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.store.store import Store
 from tests.browser import PROGRAM, Browser
 from tests.conftest import small_picture, write_small_room

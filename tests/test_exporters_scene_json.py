@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from list3r.exporters.scene_json import scene_dict, scene_schema, write_scene_json
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import OrientedBox, rotation_from_quat_wxyz
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import OrientedBox, rotation_from_quat_wxyz
 from list3r.memory.store.store import Store
 from tests.conftest import SMALL_ROOM, instance
 from tests.test_exporters import TILTED, write_split_memory

@@ -17,7 +17,7 @@ from list3r.exporters.palette import linear_from_srgb
 from list3r.exporters.usd.labels import class_token
 from list3r.exporters.usd.mesh import set_vertex_colors
 from list3r.exporters.usd.stage import UsdSettings, usd_stage, write_usd
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
 from tests.conftest import instance
 from tests.test_exporters import write_split_memory

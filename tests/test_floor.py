@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from list3r.memory.relations.instance_geometry import InstanceGeometry
-from list3r.memory.world.floor import floor_near
-from list3r.memory.world.gravity import GravitySettings
+from list3r.memory.library.relations.instance_geometry import InstanceGeometry
+from list3r.memory.library.world.floor import floor_near
+from list3r.memory.library.world.gravity import GravitySettings
 from tests.test_structure import level
 
 SETTINGS = GravitySettings()

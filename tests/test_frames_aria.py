@@ -19,7 +19,7 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.aria_trajectory import read_trajectory
 from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 from tests.recordings import put
 from tests.test_frames_recordings import world_points
 

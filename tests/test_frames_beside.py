@@ -21,7 +21,7 @@ from list3r.frames.quick_look import unusable
 from list3r.frames.recordings.stamps import as_seconds
 from list3r.frames.registration.edge_look import depth_doubts
 from list3r.frames.source import open_source
-from list3r.memory.errors import List3rError, SourceError
+from list3r.memory.core.errors import List3rError, SourceError
 from tests.frames_scenes import color_image, depth_image, moved, write_png, write_replica, write_tum
 from tests.recordings import exr, put, shots
 from tests.recordings_robots import write_video

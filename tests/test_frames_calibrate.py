@@ -19,7 +19,7 @@ from list3r.frames.registration.calibrate import DepthCalibrationSettings, calib
 from list3r.frames.registration.edge_look import depth_doubts
 from list3r.frames.registration.edges import depth_edges
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from tests.frames_scenes import cards, moved, paint, write_png
 from tests.rgbd_scenes import CAMERA, frames_along, walk
 

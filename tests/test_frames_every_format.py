@@ -17,7 +17,7 @@ from list3r.cli.app import run
 from list3r.frames.base import BadFrame
 from list3r.frames.options import KINDS, SourceOptions
 from list3r.frames.source import FOLDERS, open_source
-from list3r.memory.errors import List3rError
+from list3r.memory.core.errors import List3rError
 from tests import recordings, recordings_robots
 from tests.frames_scenes import write_replica, write_seven_scenes, write_tum
 

@@ -13,7 +13,7 @@ import pytest
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import List3rError, OptionError, SourceError
+from list3r.memory.core.errors import List3rError, OptionError, SourceError
 from tests.recordings import COUNT, K, off_plane, put, shots
 from tests.recordings_robots import BEFORE, DEPTH, FRONT, WRIST, write_depth_video, write_lerobot
 from tests.test_frames_recordings import world_points

@@ -17,7 +17,7 @@ from list3r.frames.layout import inside
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.recordings.stored import CodedArray, FileSlice, Stored, ZipMember
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 
 @pytest.mark.parametrize("name", ["../a.jpg", "p/../../a.jpg", "/etc/passwd", "..", "p/..", "p/out.jpg", "q/a.jpg"])

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from list3r.frames.options import SourceOptions, parse_distortion, parse_intrinsics, parse_range, parse_transform
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.workers import OrderedPool
 
 

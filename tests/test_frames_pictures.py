@@ -16,7 +16,7 @@ from list3r.frames.decoding.exif import exif_focal
 from list3r.frames.inspection import SourceReport
 from list3r.frames.selection import select, sharpness, working_size
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from tests.frames_scenes import color_image, depth_image, write_png
 
 EXIF_IFD = 0x8769

@@ -16,7 +16,7 @@ from list3r.frames.base import BadFrame, Frame, FrameSource
 from list3r.frames.inspection import SourceReport, draw_registration
 from list3r.frames.readers.tum import associate, poses_at
 from list3r.frames.source import SourceOptions, check_bad_share, open_source, require_camera
-from list3r.memory.errors import ExportError, OptionError, SourceError
+from list3r.memory.core.errors import ExportError, OptionError, SourceError
 from tests.frames_scenes import (
     color_image,
     depth_image,

@@ -17,7 +17,7 @@ from list3r.frames.inspection import SourceReport
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.phones.record3d import PhoneCamera
 from list3r.frames.source import open_source
-from list3r.memory.errors import List3rError, SourceError
+from list3r.memory.core.errors import List3rError, SourceError
 from tests.recordings import (
     COUNT,
     DEPTH_HEIGHT,

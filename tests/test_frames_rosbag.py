@@ -12,7 +12,7 @@ import pytest
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import List3rError, OptionError, SourceError
+from list3r.memory.core.errors import List3rError, OptionError, SourceError
 from tests import recordings
 from tests.recordings import COUNT, off_plane, shots, write_bag
 from tests.test_frames_recordings import frames_of, world_points

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.records import SessionCamera
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.records import SessionCamera
 from list3r.pipeline.chunks.calibration import stated_camera
 from tests.frames_scenes import write_png
 

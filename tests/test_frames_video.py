@@ -13,7 +13,7 @@ import pytest
 from list3r.frames.base import BadFrame, Frame
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 
 def write_video(path: Path, stamps_ms: list[int], size: tuple[int, int] = (96, 64), **codec: str) -> Path:

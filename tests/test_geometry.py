@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import (
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import (
     Sim3,
     quat_wxyz_from_rotation,
     rotation_exp,

@@ -9,11 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import list3r.memory.world.gravity as world_gravity
-from list3r.memory.geometry import Array, Sim3, rotation_exp
-from list3r.memory.overlap.planes import Planes, planar_area
+import list3r.memory.library.world.gravity as world_gravity
+from list3r.memory.core.geometry import Array, Sim3, rotation_exp
+from list3r.memory.library.overlap.planes import Planes, planar_area
+from list3r.memory.library.world.gravity import (
+    Gravity,
+    estimate_gravity,
+    floor_height,
+    gravity_from_planes,
+    world_from_graph,
+)
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import Gravity, estimate_gravity, floor_height, gravity_from_planes, world_from_graph
 from tests.conftest import box_points, chunk_result, local_instance
 
 WALLS = np.array([[-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])

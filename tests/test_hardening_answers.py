@@ -11,9 +11,9 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
-from list3r.memory.maintenance.repair import repair
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.library.maintenance import edits
+from list3r.memory.library.maintenance.repair import repair
 from list3r.memory.store.schema import SCHEMA_VERSION
 from list3r.memory.store.store import Store
 from tests.test_hardening_files import spoil

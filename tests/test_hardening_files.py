@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from list3r.cli.app import run
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.file import check_beside
 from list3r.memory.store.lock import WriterLock, lock_path
 from list3r.memory.store.store import Store

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import list3r
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.lock import lock_path
 from list3r.memory.store.store import Store
 from tests.test_safety import program

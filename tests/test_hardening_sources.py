@@ -28,8 +28,8 @@ from list3r.frames.decoding.decode import read_color, read_raw_depth
 from list3r.frames.files import too_many_pixels
 from list3r.frames.recordings import bag_chunks, stored
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import FrameError, OptionError, SourceError
-from list3r.memory.unpacking import open_archive, parse_json
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
+from list3r.memory.core.unpacking import open_archive, parse_json
 from list3r.reconstruction.precomputed_files import check_archives, read_piece
 from tests import recordings
 from tests.frames_scenes import write_png, write_replica, write_seven_scenes, write_tum

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from list3r.cli.app import run
-from list3r.memory.description.printable import shown
-from list3r.memory.errors import MemoryFileError, OptionError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, MergeDecision
+from list3r.memory.core.description.printable import shown
+from list3r.memory.core.errors import MemoryFileError, OptionError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, MergeDecision
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 

@@ -16,7 +16,7 @@ from list3r.importers.importing import IMPORTED, import_map, upright
 from list3r.importers.ply import read_vertices
 from list3r.importers.registry import read_map
 from list3r.importers.up_axis import up_axis_notes
-from list3r.memory.errors import List3rError, MemoryFileError, OptionError, SourceError
+from list3r.memory.core.errors import List3rError, MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.viewer.world import read_world
 from tests.recordings import put

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.maintenance.temporary_views import store_shown
-from list3r.memory.records import Instance
-from list3r.memory.search import vectors
-from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import Instance
+from list3r.memory.library.maintenance.temporary_views import store_shown
+from list3r.memory.store.search import vectors
+from list3r.memory.store.search.vectors import VectorIndex
 from list3r.memory.store.store import Store
 from list3r.queries.match import Filters
 from list3r.queries.nearest import nearest

@@ -10,9 +10,9 @@ import pytest
 from list3r.frames.base import Frame
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.library import build_library
-from list3r.memory.geometry import upright_box
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import LocalInstance, LocalLibrary
+from list3r.memory.core.geometry import upright_box
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import LocalInstance, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -7,8 +7,8 @@ import pytest
 
 from list3r.frames.base import Frame
 from list3r.instances.library import build_library
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import LocalInstance, LocalLibrary
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import LocalInstance, LocalLibrary
 from tests.test_instances_library import FLOOR, WALL, Block, look_at, reconstruction_of, render, world_points
 
 CHEST = Block((-0.7, 1.2, 0.0), (0.4, 1.65, 0.85), (150, 100, 60))

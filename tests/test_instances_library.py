@@ -16,8 +16,8 @@ from list3r.instances.learned.discovery import LearnedDiscoverer
 from list3r.instances.library import InstanceSettings, build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.tracking.joining import join_candidates
-from list3r.memory.masks import decode_mask, shown_surface
-from list3r.memory.records import LocalInstance, LocalLibrary
+from list3r.memory.core.masks import decode_mask, shown_surface
+from list3r.memory.core.records import LocalInstance, LocalLibrary
 from list3r.memory.store.store import Store
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import make_keyframes

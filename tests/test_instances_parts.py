@@ -12,7 +12,7 @@ from list3r.instances.geometric.features import mean_feature, object_feature
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.library import InstanceSettings
 from list3r.instances.tracking.reprojection import encode_labels
-from list3r.memory.masks import decode_mask, encode_mask
+from list3r.memory.core.masks import decode_mask, encode_mask
 from list3r.reconstruction.base import Reconstruction
 from tests.test_instances_library import SCENE, walk
 

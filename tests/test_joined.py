@@ -12,7 +12,7 @@ import pytest
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 
 def write(path: Path, first: int, count: int, size: tuple[int, int] = (64, 48)) -> Path:

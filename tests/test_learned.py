@@ -28,7 +28,7 @@ from list3r.instances.learned.verdicts import SegmentVerdicts, classify_segments
 from list3r.instances.learned.weights import COMPUTED, FORMAT, SHIPPED, load_weights
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings, SegmentSettings
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.choice import settings_asked, settings_resumed
 from list3r.pipeline.request import BuildRequest
 from list3r.pipeline.settings import BuildSettings

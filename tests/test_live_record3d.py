@@ -17,7 +17,7 @@ from list3r.frames.live.spooled import StreamFeed
 from list3r.frames.live.stream import open_camera
 from list3r.frames.live.usbmux import ADDRESS
 from list3r.frames.source import open_source
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.pipeline.live import build_live
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch
 from list3r.simulation.dataset import WalkSettings

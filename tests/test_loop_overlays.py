@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from list3r.association.revisits.loop_overlay import compare, draw_loop, write_loop
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples, Keyframe
 from tests.association_scenes import CAMERA, film
 
 S_V_U = Sim3.exp([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, 0.3])

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
 from benchmarks.simulation.presets import make_video
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkResult
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult
 from list3r.memory.store.store import Store
 from list3r.pipeline import mapping, placing
 from list3r.pipeline.settings import AssociationSettings

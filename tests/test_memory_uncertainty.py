@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow
+from list3r.memory.library.overlap.voxels import chunk_shapes
 from list3r.memory.library.uncertainty import position_covariance, position_sigma, signs_of
-from list3r.memory.overlap.voxels import chunk_shapes
-from list3r.memory.records import ChunkRow
 from tests.memory_scenes import IMAGE, MUG, TABLE, node, surface
 
 

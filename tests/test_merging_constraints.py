@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from list3r.memory.constraints import Constraints, Edit, Key, standing
-from list3r.memory.geometry import Sim3
-from list3r.memory.overlap.voxels import chunk_shapes
+from list3r.memory.core.constraints import Constraints, Edit, Key, standing
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.library.overlap.voxels import chunk_shapes
 from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, TWIN, merge_nodes, node, surface, walk
 
 WALK = walk([MUG, TWIN, BOX], 3, linked=False)

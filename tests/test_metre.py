@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.memory.geometry import rotation_exp
-from list3r.memory.overlap.metre import height_over_floor, metre_by_height, metre_by_sight
+from list3r.memory.core.geometry import rotation_exp
+from list3r.memory.library.overlap.metre import height_over_floor, metre_by_height, metre_by_sight
 
 LOOKING_DOWN = 0.12
 

@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 
 import list3r
 from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.models.cache import (
     cache_folder,
     check_weights,

@@ -10,8 +10,8 @@ import pytest
 
 from list3r.frames.base import Frame
 from list3r.instances.library import build_library
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import LocalLibrary
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
 from list3r.reconstruction.motion.tracks import track_movers

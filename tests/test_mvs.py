@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.core.geometry import rotation_exp
 from list3r.reconstruction.mvs import sweep
 from list3r.reconstruction.mvs.fill import fill_regions
 from list3r.reconstruction.mvs.fusion import DepthMap, fill_flat, project_depth, rims_out

@@ -9,8 +9,8 @@ from list3r.instances.geometric.support import without_rims
 from list3r.instances.geometric.views import chunk_views, forget_views
 from list3r.instances.library import build_library
 from list3r.instances.settings import InstanceSettings
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import LocalInstance, LocalLibrary
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import LocalInstance, LocalLibrary
 from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.mvs.stereo import PosedFrames, dense_depth, stereo_noise
 from tests.rgbd_scenes import BOXES, CAMERA, frames_along, walk

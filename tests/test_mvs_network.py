@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from list3r.frames.source import SourceInfo
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.choice import BuildRequest, settings_asked
 from list3r.reconstruction.mvs.network import (
     PLANES,

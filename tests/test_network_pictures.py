@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.errors import TrackingError
+from list3r.memory.core.errors import TrackingError
 from list3r.reconstruction.base import WindowSide, backproject, reconstruct_jointly
 from list3r.reconstruction.feedforward.output import WindowOutput, to_reconstruction
 from list3r.reconstruction.feedforward.pictures import Loader, Placement, fitted, pictures

@@ -13,8 +13,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera
-from list3r.memory.errors import DegenerateError, OptionError, TrackingError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError, OptionError, TrackingError
+from list3r.memory.core.geometry import Sim3
 from list3r.models.cards import MemoryFigures
 from list3r.models.device import MemoryBudget, is_out_of_memory, pictures_that_fit
 from list3r.reconstruction.base import Reconstruction

@@ -18,7 +18,7 @@ from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_t
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.models.device import Gpu
 from list3r.pipeline import choice

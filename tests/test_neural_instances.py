@@ -22,8 +22,8 @@ from list3r.instances.neural.sam_masks import SamMasks
 from list3r.instances.registry import check_choice, make_discoverer, make_frame_descriptor, make_tracker
 from list3r.instances.settings import CandidateSettings, InstanceSettings, SamMaskSettings, VideoTrackerSettings
 from list3r.instances.tracking.video_tracker import VideoTracker, _Objects
-from list3r.memory.errors import OptionError
-from list3r.memory.records import LocalLibrary
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import LocalLibrary
 from list3r.models import pretrained
 from list3r.models.images import InputShape, network_input, to_picture
 from list3r.reconstruction.keyframe_record import KeyframeNetworks, make_keyframes

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from list3r.memory.description.nouns import (
+from list3r.memory.core.description.nouns import (
     LANGUAGES,
     all_nouns,
     branch_of,
@@ -21,8 +21,8 @@ from list3r.memory.description.nouns import (
     uses,
     usual_size_cm,
 )
-from list3r.memory.description.spelling import split_words
-from list3r.memory.description.words import kind_word, vocabulary
+from list3r.memory.core.description.spelling import split_words
+from list3r.memory.core.description.words import kind_word, vocabulary
 
 NOUNS = st.sampled_from(sorted(all_nouns()))
 
@@ -108,6 +108,6 @@ def test_an_instance_is_kept_under_what_it_is_called() -> None:
 
 
 def test_the_licence_of_wordnet_lies_beside_the_table() -> None:
-    folder = files("list3r.memory.description")
+    folder = files("list3r.memory.core.description")
     assert "WordNet 3.0 Copyright" in (folder / "nouns.LICENSE.txt").read_text()
     assert len((folder / "nouns.tsv").read_bytes()) < 150_000

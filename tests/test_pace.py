@@ -15,7 +15,7 @@ from list3r.frames.base import BadFrame, Frame, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.chunking.pace import PaceSettings, depth_step, picture_flows
 from list3r.frames.source import SourceOptions
-from list3r.memory.geometry import umeyama
+from list3r.memory.core.geometry import umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings

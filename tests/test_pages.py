@@ -12,8 +12,8 @@ import apsw
 import pytest
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store import database
 from list3r.memory.store.file import PAGE_BYTES, connected, fold_in
 from list3r.memory.store.pages import PageDamaged

@@ -15,10 +15,10 @@ from list3r.frames.base import BadFrame, Frame
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.deferred import LazyFrame, read_some
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.geometry import Sim3, rotation_exp
+from list3r.memory.core.geometry import Sim3, rotation_exp
 from list3r.memory.library.evidence import EvidenceSettings, weigh
-from list3r.memory.overlap.pair_scores import pair_scores
-from list3r.memory.overlap.voxels import ChunkShapes, chunk_shapes, read_every
+from list3r.memory.library.overlap.pair_scores import pair_scores
+from list3r.memory.library.overlap.voxels import ChunkShapes, chunk_shapes, read_every
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings

@@ -16,8 +16,8 @@ from list3r.association.overlap import overlap_edge
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings
 from list3r.association.overlap.shared_points import Pairs
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples
 
 CAMERA = Camera(100, 80, 100.0, 100.0, 50.0, 40.0)
 SETTINGS = PaperSupportSettings()

@@ -20,7 +20,7 @@ from benchmarks.peers.vggt_long import (
     optimise,
     robust_similarity,
 )
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 from tests.published_cases import SPANS, looks_of_a_walk, matched_points, ring_with_a_loop
 
 SETTINGS = VggtLongSettings()

@@ -11,9 +11,9 @@ from PIL import Image
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Observation
+from list3r.memory.core.errors import OptionError, UnknownIdError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Observation
 from list3r.memory.store.store import Store
 from tests.conftest import box_points, chunk_result, instance, local_instance, small_picture, write_small_room
 

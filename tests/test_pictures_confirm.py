@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from list3r.memory.overlap.missed import frames_beside, pictures_confirm
-from list3r.memory.overlap.voxels import PIXEL_BITS, ChunkShapes, chunk_shapes
+from list3r.memory.library.overlap.missed import frames_beside, pictures_confirm
+from list3r.memory.library.overlap.voxels import PIXEL_BITS, ChunkShapes, chunk_shapes
 
 FRAMES = range(0, 30, 3)
 

@@ -14,7 +14,7 @@ from list3r.frames.base import Camera, Frame, SourceInfo
 from list3r.frames.options import SourceOptions
 from list3r.frames.pose_agreement import CONVENTIONS, disagreements
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 from list3r.pipeline.session import check_agreement
 from tests import recordings
 from tests.recordings import WITH_DEPTH, shots

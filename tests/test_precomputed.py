@@ -17,8 +17,8 @@ from list3r.instances.geometric.features import color_feature
 from list3r.instances.library import build_library
 from list3r.instances.registry import check_choice, make_discoverer
 from list3r.instances.settings import InstanceSettings
-from list3r.memory.errors import OptionError, TrackingError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import OptionError, TrackingError
+from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.base import DepthNoise
 from list3r.reconstruction.precomputed_files import (
     Manifest,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.memory.errors import ExportError, OptionError, SourceError
+from list3r.memory.core.errors import ExportError, OptionError, SourceError
 from list3r.reconstruction.feedforward.pictures import CutSize, WidthSize
 from list3r.reconstruction.outputs.base import OutputOptions
 from list3r.reconstruction.outputs.exr import read_exr

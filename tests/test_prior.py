@@ -9,9 +9,9 @@ import pytest
 
 from list3r.association.overlap.prior_edge import PriorEdgeSettings, prior_edge
 from list3r.frames.base import Frame, SourceInfo
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3, rotation_exp
-from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, FrameSamples, LocalLibrary
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3, rotation_exp
+from list3r.memory.core.records import ChunkResult, ChunkRow, FrameRow, FrameSamples, LocalLibrary
 from list3r.pipeline.session import check_buildable, resolve_settings
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import Reconstruction

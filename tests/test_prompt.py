@@ -22,7 +22,7 @@ from list3r.exporters.prompt.cognitive_map import cognitive_maps
 from list3r.exporters.prompt.coverage import cover
 from list3r.exporters.prompt.pack import PackSettings, write_prompt
 from list3r.exporters.prompt.tokens import count_tokens
-from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.store.store import Store
 from tests.conftest import instance, small_picture, write_small_room
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError
-from list3r.memory.search.vectors import VectorIndex
+from list3r.memory.core.errors import OptionError, SpaceMismatchError, UnknownIdError
+from list3r.memory.store.search.vectors import VectorIndex
 from list3r.memory.store.store import Store
 from list3r.queries.nearest import nearest
 from list3r.queries.relations import relations

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.records import Observation
+from list3r.memory.core.errors import OptionError, UnknownIdError
+from list3r.memory.core.records import Observation
 from list3r.memory.store.store import Store
 from list3r.queries.match import Match
 from list3r.queries.seen import seen, visible

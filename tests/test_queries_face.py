@@ -13,7 +13,7 @@ import pytest
 
 import list3r
 from list3r.api import SceneMemory
-from list3r.memory.errors import MemoryFileError, OptionError, UnknownIdError
+from list3r.memory.core.errors import MemoryFileError, OptionError, UnknownIdError
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 

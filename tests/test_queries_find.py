@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Relation
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Relation
 from list3r.memory.store.store import Store
 from list3r.queries.find import Found, find
 from list3r.queries.finding.grammar import parse

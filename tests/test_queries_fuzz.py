@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import list3r
 from list3r.api import SceneMemory
 from list3r.cli.app import run
-from list3r.memory.errors import List3rError
+from list3r.memory.core.errors import List3rError
 from list3r.memory.store.store import Store
 from list3r.queries.finding.tokens import relation_words
 from list3r.queries.match import Filters, Match

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.records import Instance, Relation
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import Instance, Relation
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.match import Match

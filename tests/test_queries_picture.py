@@ -13,7 +13,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.instances.geometric.features import COLOR_PART, color_feature, object_feature
 from list3r.instances.settings import FEATURE_SPACE
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 from list3r.memory.store.store import Store
 
 Make = Callable[..., Path]

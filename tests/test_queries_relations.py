@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.records import Relation
+from list3r.memory.core.errors import OptionError, UnknownIdError
+from list3r.memory.core.records import Relation
 from list3r.memory.store.store import Store
 from list3r.queries.path import path
 from list3r.queries.relations import Relations, relations

@@ -16,7 +16,7 @@ import list3r
 from list3r.api import SceneMemory
 from list3r.cli.app import run
 from list3r.importers.importing import import_map
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.queries.finding.grammar import parse
 
 ROOM: dict[str, tuple[str, tuple[float, float, float], tuple[float, float, float]]] = {

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import Instance, Relation
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import Instance, Relation
 from list3r.memory.store.store import Store
 
 

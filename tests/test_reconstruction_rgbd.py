@@ -11,8 +11,8 @@ import pytest
 from list3r.frames.base import Frame
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, TrackingError
-from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.memory.core.errors import OptionError, TrackingError
+from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.reconstruction.base import backproject
 from list3r.reconstruction.rgbd.confidence import depth_confidence
 from list3r.reconstruction.rgbd.odometry import CameraTracker

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from list3r.memory.geometry import rotation_exp
-from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box
-from list3r.memory.relations.predicates import INVERSE, relations
-from list3r.memory.relations.scene import certainty
-from list3r.memory.relations.symmetry import round_axis
+from list3r.memory.core.geometry import rotation_exp
+from list3r.memory.library.relations.instance_geometry import InstanceGeometry, fit_box
+from list3r.memory.library.relations.predicates import INVERSE, relations
+from list3r.memory.library.relations.scene import certainty
+from list3r.memory.library.relations.symmetry import round_axis
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, TWIN, WALL, Piece, surface
 
 LEGS = [Piece("leg", (x, y, 0.35), (0.05, 0.05, 0.7), points=150) for x in (-0.65, 0.65) for y in (-0.35, 0.35)]

@@ -10,7 +10,7 @@ from list3r.cli.app import commands
 from list3r.frames.base import Camera, SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.options import SourceOptions
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
 from list3r.memory.store.store import Store
 from list3r.pipeline.choice import (

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from list3r.catalog.reading import read_content
-from list3r.memory.errors import MemoryFileError, MemoryFileWarning
-from list3r.memory.maintenance import edits
+from list3r.memory.core.errors import MemoryFileError, MemoryFileWarning
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from tests.conftest import write_small_room
 from tests.program import in_process as run
@@ -23,7 +23,7 @@ Make = Callable[..., Path]
 
 WRITER = """
 import os, sys
-from list3r.memory.maintenance import edits
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 store = Store.open(sys.argv[1], writable=True)
 for label in sys.argv[3:]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.store import connection, file, schema
 from list3r.memory.store.rows.codec import pack, unpack
 from list3r.memory.store.store import Store

@@ -14,9 +14,9 @@ import pytest
 
 from list3r.cli.app import run
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance.repair import repair
-from list3r.memory.records import Instance
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import Instance
+from list3r.memory.library.maintenance.repair import repair
 from list3r.memory.store.file import PAGE_BYTES, connected
 from list3r.memory.store.store import Store
 from tests.conftest import SMALL_ROOM, write_small_room

@@ -18,11 +18,11 @@ from list3r.api import open as open_scene
 from list3r.cli.app import run
 from list3r.exporters.scene_json import write_scene_json
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.maintenance import edits
-from list3r.memory.records import ChunkResult, Instance
+from list3r.memory.core.errors import OptionError, UnknownIdError
+from list3r.memory.core.records import ChunkResult, Instance
+from list3r.memory.library.maintenance import edits
+from list3r.memory.library.world.scale import parse_anchor
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import parse_anchor
 from list3r.pipeline import mapping
 
 

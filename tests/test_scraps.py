@@ -11,10 +11,10 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.maintenance.scraps import derive_scraps
-from list3r.memory.maintenance.unlisted import derive_unlisted
-from list3r.memory.records import FIRST_SCRAP, FIRST_UNLISTED, ChunkResult, LocalInstance
+from list3r.memory.core.errors import OptionError, UnknownIdError
+from list3r.memory.core.records import FIRST_SCRAP, FIRST_UNLISTED, ChunkResult, LocalInstance
+from list3r.memory.library.maintenance.scraps import derive_scraps
+from list3r.memory.library.maintenance.unlisted import derive_unlisted
 from list3r.memory.store.store import Store
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, Piece
 from tests.test_consolidation import add, chunk, content, create, local

@@ -30,7 +30,7 @@ import httpx2
 from mcp import Client, StdioServerParameters
 from mcp.client.streamable_http import streamable_http_client
 
-from list3r.server.app import HttpSettings, make_server
+from list3r.server.mcp.app import HttpSettings, make_server
 
 T = TypeVar("T")
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)

@@ -21,9 +21,9 @@ from urllib.parse import quote, urlsplit
 import pytest
 
 from list3r.catalog import Catalog
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
-from list3r.service.tokens import make_token, refusal
+from list3r.server.http.tokens import make_token, refusal
 from tests.conftest import write_small_room
 
 SECRET = "a secret of the tests, long enough"
@@ -294,9 +294,9 @@ def test_a_client_that_takes_no_answers_is_let_go(service: Service) -> None:
 def test_what_is_being_answered_keeps_its_place(tmp_path: Path) -> None:
     """Two requests wait for the database, which are as many as may: others are told so, and cost them nothing."""
     uvicorn = pytest.importorskip("uvicorn", reason="uvicorn is not installed: pip install 'list3r[serve]'")
-    from list3r.service.app import make_service
-    from list3r.service.limits import ServiceLimits
-    from list3r.service.running import server_config
+    from list3r.server.http.app import make_service
+    from list3r.server.http.limits import ServiceLimits
+    from list3r.server.http.running import server_config
 
     limits = ServiceLimits(request_s=60.0, at_once=2, open_at_once=8, of_one_address=4)
     with Catalog.open(str(tmp_path / "catalog.sqlite")) as catalog, socket.create_server(("127.0.0.1", 0)) as listener:

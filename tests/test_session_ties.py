@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from list3r.association.revisits.further_pairs import FurtherPairSettings, similar_views
 from list3r.association.revisits.session_edges import defer_session_edges
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, Edge, FrameSamples
-from list3r.memory.world.session_ties import SessionTies, counted_once
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow, Edge, FrameSamples
+from list3r.memory.library.world.session_ties import SessionTies, counted_once
 
 CHUNKS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 3, 6: 3}
 """Session of each chunk; chunk k stands at x = k metres."""

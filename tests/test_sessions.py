@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from list3r.memory.core.records import Instance
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.maintenance.history import world_at
-from list3r.memory.records import Instance
+from list3r.memory.library.maintenance.history import world_at
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes

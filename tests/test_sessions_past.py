@@ -10,9 +10,9 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.maintenance.as_of import store_at
+from list3r.memory.library.maintenance.as_of import store_at
 from list3r.memory.store.store import Store
 from list3r.queries.nearest import nearest
 from list3r.queries.within import within

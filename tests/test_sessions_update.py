@@ -13,7 +13,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.core.errors import OptionError, TrackingError
 from list3r.memory.store.store import Store
 from list3r.pipeline.reports import ties
 from list3r.pipeline.request import RunOptions, Watch

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.settings import from_plain, stored_settings
 from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings, settings_of
-from list3r.memory.settings import from_plain, stored_settings
 from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import AssociationSettings, BuildSettings, session_settings

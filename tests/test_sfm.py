@@ -13,8 +13,8 @@ import pytest
 
 from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import TrackingError
-from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.memory.core.errors import TrackingError
+from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.reconstruction.mvs.settings import MvsSettings, SweepSettings
 from list3r.reconstruction.registry import MODELS, ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.calibration import calibrate

@@ -12,7 +12,7 @@ import pytest
 from list3r.frames.base import BadFrame, Frame
 from list3r.frames.chunking.borrowing import frames_around
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.geometry import umeyama
+from list3r.memory.core.geometry import umeyama
 from list3r.reconstruction.sfm.consistency import contradicted
 from list3r.reconstruction.sfm.links import context_step
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, agreed, build_maps, first_pairs

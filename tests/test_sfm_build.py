@@ -12,8 +12,8 @@ import pytest
 import list3r
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import TrackingError
-from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.memory.core.errors import TrackingError
+from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
 from list3r.pipeline.chunks.calibration import estimated_camera

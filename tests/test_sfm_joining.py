@@ -10,8 +10,8 @@ import pytest
 from list3r.association.overlap.camera_edge import better_edge, camera_edge
 from list3r.association.revisits.reprojection_edge import refine_loop
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3, rotation_exp, rotation_log
-from list3r.memory.records import Edge, FrameSamples, Keyframe
+from list3r.memory.core.geometry import Sim3, rotation_exp, rotation_log
+from list3r.memory.core.records import Edge, FrameSamples, Keyframe
 from list3r.reconstruction.sfm.mapping import KeyframeView, SparseMap, steady
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

@@ -12,8 +12,8 @@ import pytest
 
 from list3r.frames.base import Camera, Frame
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import umeyama
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import umeyama
 from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LearnedDetector
 from list3r.reconstruction.registry import ModelOptions, make_reconstructor

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.simulation.changes import Change, apply_changes, random_changes
 from list3r.frames.base import Camera
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.rendering.render import RenderedFrame, Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
 from list3r.simulation.walk import PathSettings, camera_path, viewing_poses

@@ -13,7 +13,7 @@ from list3r.evaluation.scene import evaluate_scene, read_scene
 from list3r.evaluation.trajectory import read_tum
 from list3r.frames.base import Frame
 from list3r.frames.source import open_source
-from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.core.errors import ExportError, OptionError
 from list3r.simulation.dataset import WalkSettings, write_walk
 
 SETTINGS = WalkSettings(seed=2, frames=26, start=40, size=(160, 120), write_ids=True)

@@ -18,10 +18,10 @@ from benchmarks.simulation.presets import make_video
 from benchmarks.simulation.returns import make_return
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.chunking.chunks import ChunkSpan
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3, rotation_log, umeyama
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3, rotation_log, umeyama
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import FrameSamples
 
 SPAN = ChunkSpan(2, 140, 240)
 

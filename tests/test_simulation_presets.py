@@ -17,7 +17,7 @@ from benchmarks.simulation.takes import Shot
 from benchmarks.simulation.video import SimulatedVideo
 from benchmarks.simulation.walks import PresetWalk
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.dataset import WalkSettings, write_walk
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.walk import PathSettings, camera_path

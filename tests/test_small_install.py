@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from list3r.memory.errors import EXTRA_OF_PACKAGE
+from list3r.memory.core.errors import EXTRA_OF_PACKAGE
 
 ROOT = Path(__file__).resolve().parents[1]
 

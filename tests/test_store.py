@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.errors import MemoryFileError, UnknownIdError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, MergeDecision, Observation
+from list3r.memory.core.errors import MemoryFileError, UnknownIdError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, MergeDecision, Observation
 from list3r.memory.store.store import Store
 from tests.conftest import SMALL_ROOM, chunk_result, local_instance
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.maintenance import edits
-from list3r.memory.records import ChangeEvent, DetectedLabel, Votes
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import ChangeEvent, DetectedLabel, Votes
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.file import connected
 from list3r.memory.store.rows.json_values import array_scalar, typed

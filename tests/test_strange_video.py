@@ -13,7 +13,7 @@ from list3r.frames.base import BadFrame, Frame, SourceInfo
 from list3r.frames.chunking.borrowing import borrow
 from list3r.frames.chunking.chunks import ChunkSpan
 from list3r.frames.source import SourceOptions
-from list3r.memory.geometry import rotation_exp, umeyama
+from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.sfm.calibration import _longest_run, _spans

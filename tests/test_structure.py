@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.memory.geometry import upright_box
-from list3r.memory.relations.instance_geometry import InstanceGeometry
-from list3r.memory.relations.structure import StructureSettings, classify_structure
+from list3r.memory.core.geometry import upright_box
+from list3r.memory.library.relations.instance_geometry import InstanceGeometry
+from list3r.memory.library.relations.structure import StructureSettings, classify_structure
 
 COMPUTED = StructureSettings(floor_band_m=StructureSettings().computed_floor_band_m)
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.memory.change.moves import difference
-from list3r.memory.change.places import GroupLooks
-from list3r.memory.change.records import ChangeSettings
-from list3r.memory.change.surface_colors import LightBetween, hue_distance, lab, palette_distance
+from list3r.memory.library.change.moves import difference
+from list3r.memory.library.change.places import GroupLooks
+from list3r.memory.library.change.records import ChangeSettings
+from list3r.memory.library.change.surface_colors import LightBetween, hue_distance, lab, palette_distance
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.store.store import Store
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together

@@ -11,9 +11,9 @@ from list3r.association.graph.pose_graph import GraphResult, optimize
 from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.surface_graph import place_by_surfaces
 from list3r.association.overlap.camera_edge import camera_edge
-from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.bends import Bend
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples
 from tests.association_scenes import film
 
 LENGTH, STEP, COUNT = 60, 40, 3
@@ -59,7 +59,7 @@ def cameras(samples: dict[int, FrameSamples], graph: GraphResult, bends: dict[in
 
 
 def test_depth_tells_how_large_a_chunk_is_and_the_cameras_stay() -> None:
-    from list3r.memory.geometry import umeyama
+    from list3r.memory.core.geometry import umeyama
 
     samples = chunks(1.1)
     graph, bends = by_cameras(samples)

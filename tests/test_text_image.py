@@ -13,7 +13,7 @@ pytest.importorskip("transformers")
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.queries.finding.free_words import named_by_vectors

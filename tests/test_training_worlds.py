@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("open3d")
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from training.worlds.catalogue import BUILT_IN, FAMILIES, HELD_OUT, KINDS, ODD, kinds_at
 from training.worlds.draft import Draft, Zone
 from training.worlds.film import FilmSettings, make_film

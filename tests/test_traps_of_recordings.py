@@ -15,7 +15,7 @@ from list3r.frames.base import Frame, FrameSource
 from list3r.frames.convert import convert
 from list3r.frames.live.stream import open_camera
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 from tests import recordings
 from tests.recordings import COUNT, DEPTH_HEIGHT, DEPTH_WIDTH, HEIGHT, WIDTH, K, off_plane, plane_depth, png, put
 

@@ -17,8 +17,8 @@ import list3r
 from list3r.frames.live.feed import LiveSettings
 from list3r.frames.quick_look import unusable
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import SourceError
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.core.errors import SourceError
+from list3r.memory.core.geometry import rotation_exp
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import build
 from list3r.pipeline.live import build_live

@@ -21,16 +21,16 @@ from list3r.exporters.plan.view import choose_rotation
 from list3r.exporters.scene_json import write_scene_json
 from list3r.exporters.simready.assembly import SimreadySettings, write_simready
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Array, Sim3, rotation_exp
-from list3r.memory.maintenance import edits
-from list3r.memory.overlap.planes import Planes, sampled_faces
-from list3r.memory.records import FrameSamples
-from list3r.memory.relations.predicates import relations
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Array, Sim3, rotation_exp
+from list3r.memory.core.records import FrameSamples
+from list3r.memory.library.maintenance import edits
+from list3r.memory.library.overlap.planes import Planes, sampled_faces
+from list3r.memory.library.relations.predicates import relations
+from list3r.memory.library.world.gravity import Gravity, gravity_from_planes, gravity_of, sure_of_up
+from list3r.memory.library.world.guess import GUESS, GuessSettings, guess_metre
+from list3r.memory.library.world.held import parse_up, up_as_held
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import Gravity, gravity_from_planes, gravity_of, sure_of_up
-from list3r.memory.world.guess import GUESS, GuessSettings, guess_metre
-from list3r.memory.world.held import parse_up, up_as_held
 from list3r.pipeline import mapping
 from list3r.pipeline.filming import film_advice
 from list3r.pipeline.finishing import guess_anew

@@ -26,7 +26,7 @@ from safetensors.torch import load_file, save_file
 import list3r
 from list3r.cli.app import run
 from list3r.evaluation.trajectory import Trajectory, evaluate_trajectory, read_tum
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.models.upstream import quiet, upstream_class
 from list3r.pipeline import session as session_stage
 from list3r.pipeline.chunks import chunk as chunk_stage

@@ -12,7 +12,7 @@ import pytest
 
 from list3r.frames.base import BadFrame, Frame
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 COUNT = 16
 

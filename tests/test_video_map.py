@@ -21,8 +21,8 @@ from list3r.association.whole_map.views import MapView, shared_views
 from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.frames.source import open_source
-from list3r.memory.geometry import Sim3, umeyama
-from list3r.memory.records import ChunkRow, FrameSamples
+from list3r.memory.core.geometry import Sim3, umeyama
+from list3r.memory.core.records import ChunkRow, FrameSamples
 from list3r.pipeline.chunks.whole_map import map_spans
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.sfm.adjustment import adjust

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 
 import list3r
 from list3r.cli.app import run
-from list3r.memory.errors import List3rError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.errors import List3rError
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import Relation
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.records import Relation
 from list3r.memory.store.store import Store
 from tests.conftest import small_picture, write_small_room
 from tests.session_scenes import ROOM, Box, add_session, cameras, place_together

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import list3r
-from list3r.memory.errors import DISTRIBUTION, EXTRA_OF_PACKAGE, install_hint
+from list3r.memory.core.errors import DISTRIBUTION, EXTRA_OF_PACKAGE, install_hint
 from tests.test_edits import built
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.core.errors import List3rError, OptionError
 from list3r.pipeline.workers import OrderedPool, WorkerError
 from tests.program import with_signals
 

@@ -35,9 +35,9 @@ from benchmarks.simulation.covisibility import seen_share
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSpan
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalLibrary
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, FrameSamples, JointWindow, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.keyframe_record import frame_samples
 

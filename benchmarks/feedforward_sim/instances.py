@@ -18,8 +18,8 @@ from benchmarks.feedforward_sim.descriptors import (
 )
 from benchmarks.feedforward_sim.mask_errors import MaskErrorSettings, exchanged, fragments, parted
 from benchmarks.simulation.video import SimulatedVideo
-from list3r.memory.masks import encode_mask
-from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.core.masks import encode_mask
+from list3r.memory.core.records import LocalInstance, LocalLibrary, MaskTrack, Support
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]

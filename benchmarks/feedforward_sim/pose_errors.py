@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from benchmarks.feedforward_sim.runs import runs_of
 from benchmarks.simulation.video import SimulatedVideo
-from list3r.memory.geometry import Sim3, rotation_exp, skew
+from list3r.memory.core.geometry import Sim3, rotation_exp, skew
 
 Array = NDArray[np.float64]
 

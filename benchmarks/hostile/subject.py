@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
-from list3r.memory.maintenance import edits
-from list3r.memory.records import (
+from list3r.memory.core.bends import Bend
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import (
     ChangeEvent,
     DetectedLabel,
     Edge,
@@ -21,6 +20,7 @@ from list3r.memory.records import (
     SessionCamera,
     Votes,
 )
+from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
 from tests.conftest import (
     SMALL_ROOM,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.edge_information import WeightSettings, information_of, lever_of
-from list3r.memory.records import Edge
+from list3r.memory.core.records import Edge
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from list3r.association.revisits import search
 from list3r.association.revisits.frame_search import find_candidates
 from list3r.association.revisits.joint_window import joint_edge
 from list3r.association.revisits.search import RevisitSearch, RevisitSettings, ranked, with_scores
-from list3r.memory.records import Edge
+from list3r.memory.core.records import Edge
 from list3r.memory.store.store import Store
 
 

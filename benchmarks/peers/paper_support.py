@@ -23,7 +23,7 @@ from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confid
 from list3r.association.overlap.shared_points import Pairs
 from list3r.association.overlap.support import Fit, StaticSupport, static_support
 from list3r.frames.base import Camera
-from list3r.memory.errors import DegenerateError
+from list3r.memory.core.errors import DegenerateError
 
 SIGMA_R = 0.02
 """Of the confidence m_uv, as a share of the spread of the points; the paper gives none."""

@@ -13,8 +13,8 @@ from list3r.association.overlap.alignment import Alignment
 from list3r.association.overlap.alignment_covariance import FittedPairs, measure_uncertainty
 from list3r.association.overlap.balance import BalancedSupport
 from list3r.association.overlap.overlap_edge import EdgeSettings, align_support
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
 
 Array = NDArray[np.float64]
 

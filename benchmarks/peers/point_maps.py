@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.overlap.alignment import Alignment, AlignmentSettings, align, robust_start
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
 
 Floats = NDArray[np.floating]
 

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.association.revisits.joint_window import JointReconstructor
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.worlds.layout import SMALL_KINDS, Placer
 from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.truth import footprint_gap

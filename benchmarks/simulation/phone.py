@@ -18,7 +18,7 @@ from benchmarks.simulation.blind import DARK, TURN, WALKED, BlindWalk, exposed
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera, Frame
 from list3r.frames.writers.record3d import Record3dWriter
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.core.geometry import rotation_exp
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import RenderedFrame, Renderer
 from list3r.simulation.rendering.sensor import sense

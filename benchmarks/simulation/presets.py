@@ -16,7 +16,7 @@ from benchmarks.simulation.routes import Director, FreeMap, View, mapped_view
 from benchmarks.simulation.takes import Shot, Take
 from benchmarks.simulation.video import MoverTruth, SimulatedVideo
 from list3r.frames.base import Camera
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.walk import PathSettings, viewing_poses
 from list3r.simulation.worlds.world import Stop
 

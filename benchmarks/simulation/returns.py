@@ -31,7 +31,7 @@ from benchmarks.simulation.routes import Director, FreeMap, View
 from benchmarks.simulation.takes import Take
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.frames.base import Camera
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.walk import PathSettings
 from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.truth import footprint_gap

@@ -13,7 +13,7 @@ from benchmarks.simulation.changes import Change, apply_changes
 from benchmarks.simulation.presets import make_shot
 from benchmarks.simulation.returns import film_return
 from benchmarks.simulation.takes import Shot, Take
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.worlds.objects import MovingObject, SimulatedObject
 from list3r.simulation.worlds.truth import rounded

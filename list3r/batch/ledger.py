@@ -16,7 +16,7 @@ from typing import Self
 
 from list3r.batch.tasks import BatchTask
 from list3r.batch.work import Outcome
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.store.lock import WriterLock
 
 _SCHEMA = """

@@ -14,8 +14,8 @@ from list3r.batch.ledger import Ledger, TaskRow
 from list3r.batch.storage import Output, is_remote
 from list3r.batch.tasks import BatchTask
 from list3r.batch.work import BatchJob, Outcome, run_task
-from list3r.memory.errors import OptionError
-from list3r.memory.records import JsonFields
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import JsonFields
 
 STATE = "batch.sqlite"
 """Name of the manifest next to the memories."""

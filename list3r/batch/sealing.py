@@ -9,7 +9,7 @@ from pathlib import Path
 
 import apsw
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.file import connected, file_hash, fold_in
 from list3r.memory.store.store import Store

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
-from list3r.memory.errors import MemoryFileError, OptionError, SourceError
+from list3r.memory.core.errors import MemoryFileError, OptionError, SourceError
 from list3r.memory.store.file import rename_exclusively
 
 _NAME = re.compile(r"[\w][\w.-]{0,99}")

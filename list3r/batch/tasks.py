@@ -11,8 +11,8 @@ from typing import Any
 
 from list3r.batch.storage import checked_name, children, is_remote, joined, listing, read_text
 from list3r.frames.options import SourceOptions
-from list3r.memory.errors import List3rError, OptionError
-from list3r.memory.unpacking import parse_json
+from list3r.memory.core.errors import List3rError, OptionError
+from list3r.memory.core.unpacking import parse_json
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 _VIDEOS = frozenset((".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".bag", ".mcap", ".r3d"))

@@ -19,7 +19,7 @@ from pathlib import Path
 from list3r.batch.sealing import batch_keys, seal
 from list3r.batch.storage import Output, fetched, is_remote
 from list3r.batch.tasks import BatchTask
-from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.core.errors import List3rError, MemoryFileError
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store

@@ -27,10 +27,10 @@ from list3r.catalog.records import (
     UnknownMemoryError,
     Wanted,
 )
-from list3r.memory.description.words import kind_word
-from list3r.memory.errors import OptionError, SpaceMismatchError, UnknownIdError, naming_extras
-from list3r.memory.relations.predicates import PREDICATES
-from list3r.memory.search.vectors import unit_query
+from list3r.memory.core.description.words import kind_word
+from list3r.memory.core.errors import OptionError, SpaceMismatchError, UnknownIdError, naming_extras
+from list3r.memory.library.relations.predicates import PREDICATES
+from list3r.memory.store.search.vectors import unit_query
 from list3r.queries.finding.grammar import Phrase, parse
 from list3r.queries.finding.naming import tiers
 from list3r.queries.finding.words import STRUCTURE, wanted_words

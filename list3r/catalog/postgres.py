@@ -27,7 +27,7 @@ from list3r.catalog.records import (
     Wanted,
 )
 from list3r.catalog.sqlite import check_dimension, instance_of
-from list3r.memory.search.vectors import unit
+from list3r.memory.store.search.vectors import unit
 
 _ENTRY_FIELDS = fields(MemoryEntry)
 _ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from list3r.batch.storage import checked_name, fetched, is_remote
 from list3r.catalog.records import CatalogError, CatalogInstance, MemoryContent, MemoryEntry, SpaceVectors
-from list3r.memory.description.words import vocabulary
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.core.description.words import vocabulary
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance
 from list3r.memory.store.beside import has_foreign_log
 from list3r.memory.store.file import file_hash
 from list3r.memory.store.store import Store

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import List3rError, check_choice, check_share
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import Shape
+from list3r.memory.core.errors import List3rError, check_choice, check_share
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import Shape
 from list3r.queries.match import STATES
 
 

@@ -23,8 +23,8 @@ from list3r.catalog.records import (
     SpaceVectors,
     Wanted,
 )
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.search.vectors import unit
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.store.search.vectors import unit
 
 _APPLICATION_ID = 0x4C334331
 """ASCII "L3C1"."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from list3r.cli.terminal import write
 
 if TYPE_CHECKING:
-    from list3r.memory.world.scale import Lengths
+    from list3r.memory.library.world.scale import Lengths
 
 SCHEMA = "list3r/answer/1"
 """Name and version of the envelope; the number goes up when a reader of the old one would misread the new one."""

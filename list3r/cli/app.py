@@ -22,8 +22,8 @@ import typer.core
 
 from list3r.cli.answer import print_error, wants_json
 from list3r.cli.terminal import OutputError, flush, mute, note, prepare_streams, say
-from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.errors import List3rError, MemoryFileWarning, naming_extras
+from list3r.memory.core.address_space import BUILD_MB, check_address_space
+from list3r.memory.core.errors import List3rError, MemoryFileWarning, naming_extras
 
 MODULES: dict[str, tuple[str, ...]] = {
     "build.commands": ("inspect", "build", "demo"),

@@ -10,8 +10,8 @@ import contextlib
 import os
 import sys
 
-from list3r.memory.description.printable import shown
-from list3r.memory.errors import List3rError
+from list3r.memory.core.description.printable import shown
+from list3r.memory.core.errors import List3rError
 
 _FULL = "standard output cannot be written"
 

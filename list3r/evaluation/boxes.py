@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import OrientedBox, Sim3, upright_box
+from list3r.memory.core.geometry import OrientedBox, Sim3, upright_box
 
 Array = NDArray[np.float64]
 

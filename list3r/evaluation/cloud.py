@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from list3r.memory.errors import OptionError
-from list3r.memory.records import JsonFields
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import JsonFields
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.frames.base import Camera
 from list3r.frames.files import check_ordinary
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.unpacking import open_archive
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.unpacking import open_archive
 
 Array = NDArray[np.float64]
 Shares = NDArray[np.float32]

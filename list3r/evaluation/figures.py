@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from list3r.evaluation.boxes import footprint
 from list3r.evaluation.trajectory import Trajectory
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import OrientedBox
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from list3r.evaluation.cloud import Array
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
 
 
 @dataclass(frozen=True)

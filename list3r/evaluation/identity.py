@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import OptionError
-from list3r.memory.records import JsonFields
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import JsonFields
 
 Labels = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from list3r.evaluation.boxes import box_overlaps
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import JsonFields
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import JsonFields
 
 Array = NDArray[np.float64]
 

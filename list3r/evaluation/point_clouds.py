@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from list3r.evaluation.cloud import Array, near_order
 from list3r.frames.files import check_ordinary
-from list3r.memory.errors import OptionError, SourceError, first_line
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import OptionError, SourceError, first_line
+from list3r.memory.core.geometry import Sim3
 
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 TABLES = (".xyz", ".txt", ".csv", ".pts")

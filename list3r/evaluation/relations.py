@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from list3r.memory.records import JsonFields
+from list3r.memory.core.records import JsonFields
 
 Triple = tuple[int, str, int]
 

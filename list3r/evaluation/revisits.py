@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.evaluation.covisibility import Covisibility
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Edge, JsonFields
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Edge, JsonFields
 
 Array = NDArray[np.float64]
 TRUE, FALSE, OPEN = 1, 0, -1

@@ -15,9 +15,9 @@ from list3r.evaluation.instances import InstanceErrors, evaluate_instances
 from list3r.evaluation.relations import RelationErrors, evaluate_relations
 from list3r.evaluation.trajectory import Trajectory, align, associate
 from list3r.frames.files import read_file
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz, rotation_log, umeyama
-from list3r.memory.unpacking import parse_json
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.geometry import OrientedBox, Sim3, rotation_from_quat_wxyz, rotation_log, umeyama
+from list3r.memory.core.unpacking import parse_json
 
 _REACH_M = 2.0
 """How far away objects are from a camera indoors."""

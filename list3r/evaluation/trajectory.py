@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.recordings.pose_lists import read_pose_list
-from list3r.memory.errors import DegenerateError, OptionError, SourceError
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation, rotation_log, umeyama
-from list3r.memory.records import JsonFields
+from list3r.memory.core.errors import DegenerateError, OptionError, SourceError
+from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation, rotation_log, umeyama
+from list3r.memory.core.records import JsonFields
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.exporters.output import part_path
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, FrameRow, Instance, Support
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow, FrameRow, Instance, Support
 from list3r.memory.store.store import Store
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from list3r.exporters.components import Component, component_files, has_box, thinned_support
 from list3r.exporters.output import units, write_together
 from list3r.exporters.palette import Color, instance_color, linear_from_srgb, structure_color
-from list3r.memory.errors import check_choice
-from list3r.memory.records import Instance
+from list3r.memory.core.errors import check_choice
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 
 T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

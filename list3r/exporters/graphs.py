@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from list3r.exporters.output import part_path, write_together
-from list3r.memory.description.printable import shown
-from list3r.memory.search.graphs import merge_graph, relation_graph
+from list3r.memory.core.description.printable import shown
+from list3r.memory.store.search.graphs import merge_graph, relation_graph
 from list3r.memory.store.store import Store
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from list3r.memory.errors import ExportError
+from list3r.memory.core.errors import ExportError
 
 if TYPE_CHECKING:
     from list3r.memory.store.store import Store

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from list3r.exporters.components import Component, component_files, thinned_support
 from list3r.exporters.output import units, write_together
 from list3r.exporters.palette import instance_color, structure_color
-from list3r.memory.errors import check_choice
+from list3r.memory.core.errors import check_choice
 from list3r.memory.store.store import Store
 
 _VERTEX = np.dtype(

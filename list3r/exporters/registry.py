@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from list3r.exporters.output import check_target
-from list3r.memory.address_space import USD_MB, check_address_space
-from list3r.memory.errors import OptionError, check_choice
+from list3r.memory.core.address_space import USD_MB, check_address_space
+from list3r.memory.core.errors import OptionError, check_choice
 
 if TYPE_CHECKING:  # the command line reads the names of the formats before anything heavy is needed
     from list3r.api import SceneMemory

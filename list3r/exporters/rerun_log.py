@@ -11,8 +11,8 @@ import numpy as np
 from list3r.exporters.components import Component, has_box, read_components, thinned_support
 from list3r.exporters.output import replacing, units
 from list3r.exporters.palette import instance_color
-from list3r.memory.geometry import quat_wxyz_from_rotation
-from list3r.memory.records import Instance
+from list3r.memory.core.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 
 _POINTS = 5000

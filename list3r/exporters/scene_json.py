@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 
 from list3r.exporters.components import Component, frames_per_second, has_box, read_components
 from list3r.exporters.output import replacing, units
-from list3r.memory.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.records import Instance, Relation
 from list3r.memory.library.labels import label_source
-from list3r.memory.records import Instance, Relation
+from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import lengths_of
 
 FORMAT = "list3r-scene-graph"
 VERSION = 1

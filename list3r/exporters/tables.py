@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Literal
 
-from list3r.memory.geometry import quat_wxyz_from_rotation
-from list3r.memory.records import Instance
+from list3r.memory.core.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 
 Table = Literal["instances", "relations", "frames"]

@@ -8,8 +8,8 @@ import numpy as np
 
 from list3r.exporters.components import read_components
 from list3r.exporters.output import part_path, units, write_together
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
-from list3r.memory.records import FrameRow
+from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
+from list3r.memory.core.records import FrameRow
 from list3r.memory.store.store import Store
 
 Pose = tuple[FrameRow, Sim3]

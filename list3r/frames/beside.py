@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from list3r.frames.layout import IMAGE_ENDINGS, natural_key, read_lines
 from list3r.frames.readers.tum import MAX_PAIR_GAP_S, associate
 from list3r.frames.recordings.stamps import as_seconds, times_of_names
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 Role = Literal["color", "depth", "confidence", "mask"]
 _WORDS: dict[Role, tuple[str, ...]] = {

@@ -14,8 +14,8 @@ from list3r.frames.options import SourceOptions
 from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import check_bad_share, open_source, require_camera
 from list3r.frames.writers.base import MakeWriter, SequenceWriter
-from list3r.memory.errors import ExportError, SourceError, check_choice
-from list3r.memory.records import JsonFields
+from list3r.memory.core.errors import ExportError, SourceError, check_choice
+from list3r.memory.core.records import JsonFields
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from list3r.frames.recordings.stored import CodedArray, Stored, stored_size
 from list3r.frames.registration.rig import Rig, build_rig, merge_optics
 from list3r.frames.selection import select, sharpness
 from list3r.frames.unread import not_read, not_read_note
-from list3r.memory.errors import FrameError, SourceError
+from list3r.memory.core.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
 _LATER = ("start_s", "end_s", "sharpest", "max_side", "topics", "more", "episode")

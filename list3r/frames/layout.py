@@ -18,8 +18,8 @@ from list3r.frames.base import Camera
 from list3r.frames.files import MAX_LIST_BYTES, MAX_TEXT_BYTES, open_ordinary, read_file
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.unpacking import parse_json
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.unpacking import parse_json
 
 MAX_LENGTH_M = 1e6
 """No camera stands further from where its numbers begin; single precision is 6 cm there."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.frames.base import SourceInfo

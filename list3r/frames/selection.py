@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.options import SourceOptions
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 _MEASURED_PX = 320
 """Long side of the picture whose sharpness is measured: small enough to be blind to noise and compression."""

@@ -27,7 +27,7 @@ from list3r.frames.readers import (
     tum,
 )
 from list3r.frames.readers.phones import arkitscenes, polycam, record3d, scannerapp, scannetpp, stray
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 __all__ = ["FOLDERS", "SourceOptions", "check_bad_share", "open_source", "require_camera"]
 

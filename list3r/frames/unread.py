@@ -8,7 +8,7 @@ from pathlib import Path
 from zipfile import is_zipfile
 
 from list3r.frames.recordings.stored import CodedArray, Stored
-from list3r.memory.unpacking import open_archive
+from list3r.memory.core.unpacking import open_archive
 
 READ: dict[str, tuple[str, ...]] = {
     "record3d": ("metadata", "rgbd", "icon"),

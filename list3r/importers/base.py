@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import read_file
-from list3r.memory.errors import SourceError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.errors import SourceError
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.unpacking import parse_json
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
-from list3r.memory.unpacking import parse_json
 
 MOST_BYTES = 2**30
 """Largest file that is read."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from list3r.frames.decoding.decode import read_raw_depth
 from list3r.importers.base import ImportedMap, ImportedObject
-from list3r.memory.errors import FrameError, SourceError, first_line
+from list3r.memory.core.errors import FrameError, SourceError, first_line
 
 _LEAST_POINTS = 10
 

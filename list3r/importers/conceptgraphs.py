@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from list3r.importers.base import ImportedMap, ImportedObject, box_surface, read_json_file, vector
-from list3r.memory.errors import SourceError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.errors import SourceError
+from list3r.memory.core.geometry import OrientedBox
 
 _NO_TAGS = ("", "item", "object", "none", "invalid")
 

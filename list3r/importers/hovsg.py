@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from list3r.frames.layout import natural_key
 from list3r.importers.base import ImportedMap, ImportedObject, read_json_file
 from list3r.importers.ply import points_of, read_vertices
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 
 def matches(path: Path) -> bool:

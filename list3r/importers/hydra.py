@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from list3r.importers.base import ImportedMap, ImportedObject, box_surface, read_json_file, vector
-from list3r.memory.errors import SourceError
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.errors import SourceError
+from list3r.memory.core.geometry import OrientedBox
 
 _OBJECTS = ("ObjectNodeAttributes", "KhronosObjectAttributes")
 _LEAST_POINTS = 30

@@ -12,10 +12,18 @@ from list3r import __version__
 from list3r.importers.base import GRAY, IMPORTED, ImportedMap, ImportedObject
 from list3r.importers.registry import read_map
 from list3r.importers.up_axis import up_axis_notes
-from list3r.memory.errors import MemoryFileError, OptionError, check_choice
+from list3r.memory.core.errors import MemoryFileError, OptionError, check_choice
+from list3r.memory.core.records import (
+    ChunkResult,
+    FrameSamples,
+    JsonFields,
+    LocalInstance,
+    LocalLibrary,
+    MaskTrack,
+    Support,
+)
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.rules import ConsolidationSettings
-from list3r.memory.records import ChunkResult, FrameSamples, JsonFields, LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.file import taken
 from list3r.memory.store.store import Store

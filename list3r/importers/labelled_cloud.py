@@ -12,7 +12,7 @@ import numpy as np
 
 from list3r.importers.base import ImportedMap, ImportedObject
 from list3r.importers.ply import points_of, read_vertices
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _NAMES = ("instance", "instance_id", "object_id", "objectid", "segment", "id")
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.files import read_file
 from list3r.importers.base import MOST_BYTES
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from list3r.importers import colmap_masks, conceptgraphs, hovsg, hydra, labelled_cloud
 from list3r.importers.base import ImportedMap
-from list3r.memory.errors import SourceError, check_choice
+from list3r.memory.core.errors import SourceError, check_choice
 
 FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], ImportedMap]]] = {
     "conceptgraphs": (conceptgraphs.matches, conceptgraphs.read),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame
-from list3r.memory.records import LocalLibrary
+from list3r.memory.core.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
 

@@ -15,7 +15,7 @@ from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.low_confidence import low_confidence_instances
 from list3r.instances.tracking.movers import with_movers
 from list3r.instances.tracking.reprojection import ReprojectionTracker
-from list3r.memory.records import LocalLibrary
+from list3r.memory.core.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
 __all__ = ["InstanceSettings", "build_library", "select_prompts"]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from list3r.association.overlap.overlap_edge import MeasuredEdge
 from list3r.frames.base import Camera, Frame
 from list3r.frames.decoding.decode import decode_picture
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import Keyframe, LocalLibrary
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.reprojection import ReprojectionTracker
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.instances.neural.appearance import Appearance

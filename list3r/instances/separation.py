@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from list3r.instances.geometric.features import lab_of
-from list3r.memory.records import LocalInstance
+from list3r.memory.core.records import LocalInstance
 
 WELL_VISIBLE = 0.3
 """Share of an instance's support that must be seen for its mask to count."""

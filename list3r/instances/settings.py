@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 
 FEATURE_SPACE = "geometric-color@1/64"

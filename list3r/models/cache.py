@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlparse
 from urllib.request import getproxies
 
-from list3r.memory.errors import OptionError, install_hint
+from list3r.memory.core.errors import OptionError, install_hint
 from list3r.models.cards import UNPINNED, Weights
 
 CONFIG = "config.json"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from list3r.memory.errors import OptionError, install_hint
+from list3r.memory.core.errors import OptionError, install_hint
 
 PARTS = ("geometry", "discovery", "tracking", "features", "text", "detector", "local features", "descriptor")
 """The parts of a pipeline that a model can serve."""

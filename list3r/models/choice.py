@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.models.cache import resolve
 from list3r.models.cards import ModelCard
 from list3r.models.licences import check_profile, choose_weights

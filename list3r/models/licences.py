@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from list3r.memory.errors import OptionError, check_choice
+from list3r.memory.core.errors import OptionError, check_choice
 from list3r.models.cache import split_name
 from list3r.models.cards import OTHER, Licence, ModelCard, Weights, find_weights
 

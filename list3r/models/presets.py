@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.models.cache import find_cached
 from list3r.models.cards import ModelCard, find_card
 from list3r.models.device import Gpu

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError, check_choice, first_line, install_hint
+from list3r.memory.core.errors import OptionError, check_choice, first_line, install_hint
 from list3r.models.cache import CONFIG, check_weights
 from list3r.models.device import out_of_memory_reported
 

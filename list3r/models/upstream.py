@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError, first_line
+from list3r.memory.core.errors import OptionError, first_line
 from list3r.models.cache import SINGLE_FILES, check_weights
 from list3r.models.cards import ModelCard
 from list3r.models.device import out_of_memory_reported

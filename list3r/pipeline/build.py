@@ -15,8 +15,8 @@ from threadpoolctl import threadpool_limits
 from list3r import __version__
 from list3r.frames.base import SourceInfo
 from list3r.frames.source import SourceOptions
-from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.records import ChunkResult
+from list3r.memory.core.address_space import BUILD_MB, check_address_space
+from list3r.memory.core.records import ChunkResult
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import finish_session

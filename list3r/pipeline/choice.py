@@ -9,9 +9,9 @@ from pathlib import Path
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings
 from list3r.instances.registry import DISCOVERERS
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
+from list3r.memory.library.world.held import parse_up
 from list3r.memory.store.store import Store
-from list3r.memory.world.held import parse_up
 from list3r.models.cards import ModelCard, find_card, find_weights
 from list3r.models.choice import check_allowed, parse_weights
 from list3r.models.device import find_gpu, pictures_that_fit

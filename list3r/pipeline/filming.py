@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.overlap.summaries import sample_of
-from list3r.memory.records import ChunkRow
+from list3r.memory.core.records import ChunkRow
+from list3r.memory.library.overlap.summaries import sample_of
+from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import lengths_of
 
 _PICTURES, _OF_EACH = 40, 5
 """Keyframes that are looked at, at most, and of one chunk."""

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from list3r.frames.options import SourceOptions
-from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.core.errors import List3rError, OptionError
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
-from list3r.memory.maintenance.edits import EditReport, scale
+from list3r.memory.library.maintenance.edits import EditReport, scale
+from list3r.memory.library.world.gravity import Gravity
+from list3r.memory.library.world.guess import GUESS, guess_metre
+from list3r.memory.library.world.scale import main_part, parse_anchor, rescale
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import Gravity
-from list3r.memory.world.guess import GUESS, guess_metre
-from list3r.memory.world.scale import main_part, parse_anchor, rescale
 from list3r.pipeline.request import Progress, RunOptions, Watch
 from list3r.semantics.detection import DetectReport, detect, open_sources
 
@@ -119,7 +119,7 @@ def name_things(
 
 def load_detector(file: Path, classes: Path | None) -> NanoDet:
     """Return a box detector with its classes, those of COCO unless a file names others. Raises `OptionError`."""
-    from list3r.memory.description.coco import COCO_80
+    from list3r.memory.core.description.coco import COCO_80
     from list3r.semantics.nanodet import NanoDet, read_class_names
 
     return NanoDet(file, COCO_80 if classes is None else read_class_names(classes))

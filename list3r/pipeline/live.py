@@ -27,7 +27,7 @@ from list3r.frames.live.spooled import StreamFeed
 from list3r.frames.live.stream import open_camera
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.rosbag import is_recording
-from list3r.memory.errors import MemoryFileError, OptionError, SourceError
+from list3r.memory.core.errors import MemoryFileError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.build import begin_session, build
 from list3r.pipeline.chunks.calibration import estimated_camera, with_camera

@@ -18,8 +18,9 @@ from list3r.association.revisits.search import find_loops
 from list3r.frames.base import Camera
 from list3r.instances.carving.carved_instances import ChangedPlaceSettings, add_changed_places
 from list3r.instances.overlays import write_support
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import (
     OWN_NAMES,
@@ -28,7 +29,6 @@ from list3r.memory.library.labels import (
     votes_of_names,
     votes_of_probabilities,
 )
-from list3r.memory.records import ChunkResult, ChunkRow, Edge
 from list3r.memory.store.store import Store
 from list3r.pipeline.placing import knows_cameras, place_chunks, poses_given
 from list3r.pipeline.settings import AssociationSettings, session_settings

@@ -18,15 +18,15 @@ from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.surface_graph import place_by_surfaces
 from list3r.association.overlap.camera_edge import in_one_frame
 from list3r.association.revisits.session_edges import defer_session_edges
-from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, Edge
+from list3r.memory.core.bends import Bend
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow, Edge
+from list3r.memory.library.world.gravity import estimate_gravity, world_from_graph
+from list3r.memory.library.world.guess import GUESS, guess_metre
+from list3r.memory.library.world.held import parse_up
+from list3r.memory.library.world.scale import write_scale
+from list3r.memory.library.world.session_ties import counted_once
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import estimate_gravity, world_from_graph
-from list3r.memory.world.guess import GUESS, guess_metre
-from list3r.memory.world.held import parse_up
-from list3r.memory.world.scale import write_scale
-from list3r.memory.world.session_ties import counted_once
 from list3r.pipeline.settings import AssociationSettings, session_settings
 from list3r.reconstruction.registry import MODELS
 

@@ -13,9 +13,9 @@ from list3r.frames.chunking.chunks import ChunkSpan, plan_chunks, shot_of
 from list3r.frames.chunking.cuts import find_cuts
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import check_bad_share, open_source
-from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.errors import OptionError, TrackingError
-from list3r.memory.records import JsonFields, SessionCamera
+from list3r.memory.core.address_space import BUILD_MB, check_address_space
+from list3r.memory.core.errors import OptionError, TrackingError
+from list3r.memory.core.records import JsonFields, SessionCamera
 from list3r.pipeline.chunks.calibration import estimated_camera, stated_camera
 from list3r.pipeline.chunks.chunk import ChunkTask, reconstruct
 from list3r.pipeline.request import BuildRequest, RunOptions, Watch

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from list3r.association.revisits.session_edges import DEFERRED
-from list3r.memory.records import Edge, FrameRow, JsonFields
+from list3r.memory.core.records import Edge, FrameRow, JsonFields
 from list3r.memory.store.store import Store
 from list3r.pipeline.filming import film_advice
 from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts

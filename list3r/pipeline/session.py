@@ -19,9 +19,9 @@ from list3r.frames.pose_agreement import disagreements
 from list3r.frames.registration.edge_look import depth_doubts
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.registry import check_choice
-from list3r.memory.errors import OptionError, SourceError, TrackingError
-from list3r.memory.records import ChunkResult
-from list3r.memory.settings import stored_settings
+from list3r.memory.core.errors import OptionError, SourceError, TrackingError
+from list3r.memory.core.records import ChunkResult
+from list3r.memory.core.settings import stored_settings
 from list3r.memory.store.store import Store
 from list3r.models.cards import find_card
 from list3r.models.choice import PARTS_OF_OPTIONS, pinned_weights

@@ -22,10 +22,10 @@ from list3r.frames.chunking.cuts import ShotCutSettings
 from list3r.frames.chunking.pace import PaceSettings
 from list3r.instances.carving.carved_surfaces import ChangedPlaceSettings
 from list3r.instances.settings import InstanceSettings
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import Session
+from list3r.memory.core.settings import as_plain, from_plain
 from list3r.memory.library.rules import ConsolidationSettings
-from list3r.memory.records import Session
-from list3r.memory.settings import as_plain, from_plain
 from list3r.reconstruction.settings import ReconstructionSettings
 
 

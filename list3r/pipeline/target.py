@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from list3r.frames.base import SourceInfo
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.core.errors import MemoryFileError, OptionError
 from list3r.memory.store.connection import remove_memory
 from list3r.memory.store.file import rename_exclusively, taken
 from list3r.memory.store.store import Store

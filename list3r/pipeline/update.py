@@ -13,8 +13,8 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from list3r.frames.source import SourceOptions
-from list3r.memory.address_space import BUILD_MB, check_address_space
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.core.address_space import BUILD_MB, check_address_space
+from list3r.memory.core.errors import MemoryFileError, OptionError
 from list3r.memory.store.store import Store
 from list3r.pipeline.finishing import finish
 from list3r.pipeline.mapping import finish_session

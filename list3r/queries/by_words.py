@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.find import meant
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from list3r.memory.errors import check_choice, check_share
-from list3r.memory.records import ChangeEvent, Instance
+from list3r.memory.core.errors import check_choice, check_share
+from list3r.memory.core.records import ChangeEvent, Instance
 from list3r.memory.store.store import Store
 
 KINDS = ("moved", "removed", "added", "seen_again")

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.spelling import adjectives, split_words
-from list3r.memory.description.words import kind_word, vocabulary
-from list3r.memory.errors import OptionError, UnknownIdError
-from list3r.memory.records import Instance
+from list3r.memory.core.description.spelling import adjectives, split_words
+from list3r.memory.core.description.words import kind_word, vocabulary
+from list3r.memory.core.errors import OptionError, UnknownIdError
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import lengths_of
 
 
 def info(store: Store) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from typing import ParamSpec, TypedDict, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import OptionError, UnknownIdError, check_choice, check_share
-from list3r.memory.records import BestView, Instance
+from list3r.memory.core.errors import OptionError, UnknownIdError, check_choice, check_share
+from list3r.memory.core.records import BestView, Instance
 from list3r.memory.store.store import Store
 from list3r.queries.finding.words import is_colored, is_named, wanted_words
 

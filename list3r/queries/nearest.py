@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.match import (
     FilterOptions,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 
-from list3r.memory.records import Relation
-from list3r.memory.relations.predicates import INVERSE, PREDICATES
+from list3r.memory.core.records import Relation
+from list3r.memory.library.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance
 from list3r.queries.relations import Relations

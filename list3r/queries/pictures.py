@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import too_many_pixels
-from list3r.memory.errors import MemoryFileError, OptionError
-from list3r.memory.masks import FULL_SIDE_PX, decode_mask, shown_surface
-from list3r.memory.records import ChunkRow, Instance, MaskTrack, Observation
+from list3r.memory.core.errors import MemoryFileError, OptionError
+from list3r.memory.core.masks import FULL_SIDE_PX, decode_mask, shown_surface
+from list3r.memory.core.records import ChunkRow, Instance, MaskTrack, Observation
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_instance
 from list3r.queries.views.camera import PosedCamera, cameras_of_frames
@@ -26,7 +26,7 @@ class PictureSettings:
     """How the picture of an instance is chosen."""
 
     full_side_px: float = FULL_SIDE_PX
-    """As in `list3r.memory.masks.shown_surface`."""
+    """As in `list3r.memory.core.masks.shown_surface`."""
     projected_frames: int = 12
     """So many keyframes at most are looked at for an instance that was followed in none of them."""
 
@@ -43,7 +43,7 @@ class InstanceSight:
     visible_fraction: float
     """Share of its surface inside the frame that nothing hides, in [0, 1]."""
     mask: NDArray[np.uint32]
-    """Run-length code at the picture's size, see `list3r.memory.masks`. Shape (R,)."""
+    """Run-length code at the picture's size, see `list3r.memory.core.masks`. Shape (R,)."""
 
     def worth(self, settings: PictureSettings | None = None) -> float:
         """Tell how well a picture shows the instance, in [0, 1]: how much of it, and whether large enough to see."""

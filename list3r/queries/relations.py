@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from list3r.memory.errors import OptionError, check_choice, check_share
-from list3r.memory.records import Instance, Relation
-from list3r.memory.relations.predicates import INVERSE, PREDICATES
-from list3r.memory.relations.settings import RelationSettings
+from list3r.memory.core.errors import OptionError, check_choice, check_share
+from list3r.memory.core.records import Instance, Relation
+from list3r.memory.library.relations.predicates import INVERSE, PREDICATES
+from list3r.memory.library.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
 from list3r.queries.finding.words import is_named, no_such_words, same_kind, wanted_words
 from list3r.queries.match import checked_instance, checked_point

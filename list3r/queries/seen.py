@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Unpack
 
-from list3r.memory.errors import OptionError, check_share
-from list3r.memory.records import BestView
+from list3r.memory.core.errors import OptionError, check_share
+from list3r.memory.core.records import BestView
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_instance, of_one_state
 from list3r.queries.views.camera import PosedCamera

@@ -8,9 +8,9 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from list3r.memory.errors import OptionError, SpaceMismatchError
-from list3r.memory.records import Instance
-from list3r.memory.search.vectors import VectorIndex, unit, unit_query
+from list3r.memory.core.errors import OptionError, SpaceMismatchError
+from list3r.memory.core.records import Instance
+from list3r.memory.store.search.vectors import VectorIndex, unit, unit_query
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_count, checked_instance, of_one_state
 

@@ -8,7 +8,7 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.queries.match import FilterOptions, Filters, Match, checked_length, checked_point, of_one_state
 from list3r.queries.seen import LEAST_VISIBLE, visible

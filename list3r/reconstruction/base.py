@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.errors import TrackingError
+from list3r.memory.core.errors import TrackingError
 
 
 @dataclass(frozen=True)

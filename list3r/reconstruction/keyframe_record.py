@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from list3r.compiled import compiled
 from list3r.frames.base import Camera, Frame
-from list3r.memory.masks import shown_surface
-from list3r.memory.records import Feature, FrameSamples, Keyframe, LocalLibrary
+from list3r.memory.core.masks import shown_surface
+from list3r.memory.core.records import Feature, FrameSamples, Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.features.learned import LearnedDetector, as_bytes
 from list3r.reconstruction.features.local import Features, detect, points_at

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import rotation_exp, rotation_log
+from list3r.memory.core.geometry import rotation_exp, rotation_log
 from list3r.reconstruction.poses import angle_deg, is_rigid
 
 Poses = NDArray[np.float64]

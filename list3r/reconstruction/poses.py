@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame
-from list3r.memory.errors import TrackingError
+from list3r.memory.core.errors import TrackingError
 from list3r.reconstruction.base import KeyframeSpacing
 
 Poses = NDArray[np.float64]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.errors import DegenerateError, OptionError, TrackingError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError, OptionError, TrackingError
+from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.feedforward.output import WindowOutput, to_reconstruction, with_given_poses
 from list3r.reconstruction.feedforward.settings import NetworkSettings

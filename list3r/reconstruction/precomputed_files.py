@@ -18,8 +18,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from list3r.frames.files import check_ordinary, read_file
-from list3r.memory.errors import OptionError, first_line
-from list3r.memory.unpacking import open_archive, parse_json
+from list3r.memory.core.errors import OptionError, first_line
+from list3r.memory.core.unpacking import open_archive, parse_json
 
 MANIFEST = "precomputed.json"
 FORMAT = "list3r-precomputed"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from types import ModuleType
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.base import Reconstructor
 from list3r.reconstruction.settings import ReconstructionSettings
 

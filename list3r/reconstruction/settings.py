@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from list3r.memory.masks import FULL_SIDE_PX
+from list3r.memory.core.masks import FULL_SIDE_PX
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
 from list3r.reconstruction.feedforward.settings import NetworkSettings
@@ -23,7 +23,7 @@ class KeyframeSettings:
     """A further frame is kept as a picture where the others show less than this share of the surface of an instance
     that it shows; in [0, 1], with 0 keyframes alone are kept."""
     full_side_px: float = FULL_SIDE_PX
-    """As in `list3r.memory.masks.shown_surface`."""
+    """As in `list3r.memory.core.masks.shown_surface`."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     learned_count: int = 800
     """Most learned features on a frame."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from list3r.frames.base import Frame, FrameSource
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.source import SourceOptions, open_source
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.masks import decode_mask
+from list3r.memory.core.records import ChunkRow, JsonFields, MaskTrack, Votes
 from list3r.memory.library.labels import LabelSettings, apply_labels, put_votes
-from list3r.memory.masks import decode_mask
-from list3r.memory.records import ChunkRow, JsonFields, MaskTrack, Votes
 from list3r.memory.store.store import Store
 from list3r.semantics.detector import Detector
 from list3r.semantics.voting import ThingInFrame, VotingSettings, summed, vote

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.memory.store.store import Store
 from list3r.models.licences import DEFAULT_PROFILE, choose_weights
 

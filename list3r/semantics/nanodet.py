@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
-from list3r.memory.description.coco import COCO_80
-from list3r.memory.errors import OptionError, install_hint
+from list3r.memory.core.description.coco import COCO_80
+from list3r.memory.core.errors import OptionError, install_hint
 from list3r.semantics.detector import Detections
 
 _MEAN_BGR = (103.53, 116.28, 123.675)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.files import read_file
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.semantics.embedding import stored_text_model
 

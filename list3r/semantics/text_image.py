@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
-from list3r.memory.errors import OptionError, first_line
-from list3r.memory.unpacking import parse_json
+from list3r.memory.core.errors import OptionError, first_line
+from list3r.memory.core.unpacking import parse_json
 from list3r.models.images import HALF, InputShape, network_input
 from list3r.models.pretrained import load_pretrained, pick_device, space_name
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.coco import plausible
+from list3r.memory.core.description.coco import plausible
+from list3r.memory.core.records import Votes
 from list3r.memory.library.labels import PRIOR_ODDS
-from list3r.memory.records import Votes
 from list3r.semantics.detector import Detections
 
 

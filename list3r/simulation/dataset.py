@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.evaluation.trajectory import Trajectory, write_tum
 from list3r.frames.base import Camera
-from list3r.memory.errors import ExportError, OptionError
+from list3r.memory.core.errors import ExportError, OptionError
 from list3r.pipeline.workers import OrderedPool
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.simulation.worlds.world import Stop
 
 Array = NDArray[np.float64]

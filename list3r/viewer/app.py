@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.api import SceneMemory
 from list3r.api import open as open_scene
-from list3r.memory.errors import List3rError
+from list3r.memory.core.errors import List3rError
 from list3r.viewer.clouds import CloudSettings, PageClouds, Shown
 from list3r.viewer.instance_text import described
 from list3r.viewer.layers import Layers, LayerSettings

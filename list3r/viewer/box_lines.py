@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.geometry import OrientedBox
 
 MOST_THICK = 400
 """Without a graphics card this many take a tenth of a second to draw."""

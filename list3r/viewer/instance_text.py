@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from list3r.api import SceneMemory
-from list3r.memory.records import Relation
+from list3r.memory.core.records import Relation
 from list3r.queries.path import telling
 from list3r.viewer.world import ShownWorld
 

@@ -10,8 +10,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import quat_wxyz_from_rotation
-from list3r.memory.records import Relation
+from list3r.memory.core.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.records import Relation
 from list3r.viewer.box_lines import box_lines
 from list3r.viewer.clouds import FINE
 from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, color_of, colors

@@ -7,7 +7,7 @@ import binascii
 import json
 from dataclasses import asdict, dataclass, fields
 
-from list3r.memory.unpacking import parse_json
+from list3r.memory.core.unpacking import parse_json
 from list3r.viewer.world import COLOR_MODES
 
 _LONGEST = 2000

@@ -11,8 +11,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import rotation_from_quat_wxyz
-from list3r.memory.records import Instance
+from list3r.memory.core.geometry import rotation_from_quat_wxyz
+from list3r.memory.core.records import Instance
 from list3r.viewer.world import ShownWorld
 
 Size = tuple[float, float]

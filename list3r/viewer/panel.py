@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from list3r.memory.errors import List3rError
+from list3r.memory.core.errors import List3rError
 from list3r.viewer.link import ViewState
 from list3r.viewer.world import COLOR_MODES
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from list3r.api import SceneMemory
 from list3r.exporters.palette import instance_color, structure_color
-from list3r.memory.records import Instance
+from list3r.memory.core.records import Instance
 from list3r.queries.changes import Changed
 
 CHANGE_COLORS = {"added": (40, 160, 80), "moved": (235, 140, 30), "removed": (210, 50, 60)}

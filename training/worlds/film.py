@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.geometry import rotation_exp
+from list3r.memory.core.geometry import rotation_exp
 from list3r.reconstruction.base import Reconstruction
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import Stop

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.simulation.walk import PathSettings, camera_path
 from list3r.simulation.worlds.world import Stop
 from training.worlds.collada import TexturedMesh, read_collada

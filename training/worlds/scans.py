@@ -13,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from training.worlds.collada import TexturedMesh
 from training.worlds.film import Truth
 

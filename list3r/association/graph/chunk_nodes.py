@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from list3r.association.graph.edge_information import about
 from list3r.association.overlap.shared_points import shared_samples
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples
 from list3r.reconstruction.scale_loss import lost_scale
 
 Array = NDArray[np.float64]

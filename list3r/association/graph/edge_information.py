@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.solver import adjoint
-from list3r.memory.geometry import skew, stack
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import skew, stack
+from list3r.memory.core.records import Edge
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from list3r.association.graph.marginals import Marginals, marginals, variance_factors
 from list3r.association.graph.solver import GraphProblem, adjoint
 from list3r.association.quantiles import chi2_quantile
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 Array = NDArray[np.float64]
 

@@ -30,8 +30,8 @@ from list3r.association.graph.pose_graph import (
 )
 from list3r.association.graph.solver import adjoint, unstack
 from list3r.association.quantiles import chi2_quantile
-from list3r.memory.geometry import Sim3, stack
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3, stack
+from list3r.memory.core.records import Edge
 
 Array = NDArray[np.float64]
 T = TypeVar("T")

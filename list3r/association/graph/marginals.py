@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from list3r.association.graph.solver import GraphProblem
 from list3r.association.quantiles import chi2_quantile, f_quantile
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 Array = NDArray[np.float64]
 

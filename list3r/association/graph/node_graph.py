@@ -28,9 +28,9 @@ from list3r.association.graph.edge_information import information_of
 from list3r.association.graph.pose_graph import GraphResult, GraphSettings
 from list3r.association.graph.sampled_chunks import SampledChunks
 from list3r.association.graph.solver import GraphProblem, unstack
-from list3r.memory.bends import Bend
-from list3r.memory.geometry import Sim3, stack, take
-from list3r.memory.records import Edge
+from list3r.memory.core.bends import Bend
+from list3r.memory.core.geometry import Sim3, stack, take
+from list3r.memory.core.records import Edge
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ from list3r.association.graph.edge_information import WeightSettings, informatio
 from list3r.association.graph.edge_trust import Tree, TrustedGraph, TrustSettings, solve_with_trust
 from list3r.association.graph.marginals import widening
 from list3r.association.graph.solver import GraphProblem, adjoint, unstack
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, stack, take
-from list3r.memory.records import Edge
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3, stack, take
+from list3r.memory.core.records import Edge
 
 Array = NDArray[np.float64]
 

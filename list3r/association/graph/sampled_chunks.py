@@ -16,7 +16,7 @@ from list3r.association.graph.chunk_nodes import (
     ties_of,
 )
 from list3r.association.graph.solver import adjoint
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.core.records import Edge, FrameSamples
 from list3r.memory.store.derived import Derived, LruCache
 from list3r.memory.store.store import Store
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
-from list3r.memory.geometry import Sim3, skew, take
+from list3r.memory.core.geometry import Sim3, skew, take
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.association.overlap.alignment_covariance import FittedPairs, measure_uncertainty
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
 
 Array = NDArray[np.float64]
 

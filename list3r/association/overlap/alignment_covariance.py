@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.quantiles import chi2_quantile, f_quantile
-from list3r.memory.geometry import skew
+from list3r.memory.core.geometry import skew
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3, skew
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.core.geometry import Sim3, skew
+from list3r.memory.core.records import Edge, FrameSamples
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from list3r.association.overlap.regions import EdgeSupportSettings, Floats, Ints, Mask, Regions, weighted_quantile
 from list3r.association.overlap.shared_points import Pairs, moved
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 
 @dataclass(frozen=True)

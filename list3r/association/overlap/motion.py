@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from list3r.frames.base import Camera
-from list3r.memory.records import FrameSamples, LocalInstance, LocalLibrary, MotionTrack
+from list3r.memory.core.records import FrameSamples, LocalInstance, LocalLibrary, MotionTrack
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -18,9 +18,9 @@ from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confid
 from list3r.association.overlap.shared_points import Pairs, shared_pairs
 from list3r.association.overlap.support import Fit, StaticSupport, static_support
 from list3r.frames.base import Camera
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples
 
 
 @dataclass(frozen=True)

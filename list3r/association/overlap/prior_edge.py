@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.edge_information import about
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkResult, ChunkRow, Edge, FrameRow
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, ChunkRow, Edge, FrameRow
 from list3r.reconstruction.pose_prior import PriorSettings, mean_alignment, steady_runs
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import DegenerateError
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.records import FrameSamples
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -24,8 +24,8 @@ from list3r.association.overlap.regions import (
 )
 from list3r.association.overlap.shared_points import Pairs
 from list3r.frames.base import Camera
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
 
 Fit = Callable[[Pairs, Mask], Sim3]
 """A robust similarity S_v_u from the pairs that a mask of shape (N,) chooses; raises `DegenerateError`."""

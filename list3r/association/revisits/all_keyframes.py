@@ -21,8 +21,8 @@ from list3r.association.revisits.chunk_agreement import (
     chunk_agreement,
 )
 from list3r.association.revisits.verification import VerificationSettings, verify
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, Keyframe
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from list3r.association.revisits.verification import working_view
-from list3r.memory.records import Keyframe
+from list3r.memory.core.records import Keyframe
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.rgbd.view import WorkingFrame
 

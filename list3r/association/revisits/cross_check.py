@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from list3r.association.revisits.instance_similarity import InstanceSet
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

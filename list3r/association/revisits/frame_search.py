@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.records import ChunkRow
+from list3r.memory.core.records import ChunkRow
 from list3r.memory.store.store import Store
 
 Floats = NDArray[np.float32]

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples
-from list3r.memory.world.session_ties import keyframes_of
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples
+from list3r.memory.library.world.session_ties import keyframes_of
 
 
 @dataclass(frozen=True)

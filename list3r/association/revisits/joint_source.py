@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from list3r.frames.base import Frame, FrameSource, guessed_camera
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import TrackingError
-from list3r.memory.records import JointWindow
+from list3r.memory.core.errors import TrackingError
+from list3r.memory.core.records import JointWindow
 from list3r.reconstruction.base import Reconstructor, WindowSide, reconstruct_jointly
 from list3r.reconstruction.keyframe_record import frame_samples
 

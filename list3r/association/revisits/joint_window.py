@@ -19,9 +19,9 @@ from list3r.association.overlap.alignment import align
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, measure_edge
 from list3r.association.overlap.shared_points import shared_samples
 from list3r.association.revisits.cross_check import CrossSettings, Side, cross_check, shared_view
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples, JointWindow
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples, JointWindow
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from list3r.association.graph.edge_information import about
 from list3r.association.graph.solver import adjoint
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.rgbd.frame_registration import FrameRegistration
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.frames.decoding.decode import decode_picture
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, FrameSamples, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, FrameSamples, Keyframe
 
 Image = NDArray[np.uint8]
 

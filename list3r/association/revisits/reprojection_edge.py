@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 
 from list3r.association.graph.solver import adjoint
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, Keyframe
 from list3r.reconstruction.features.local import match
 
 Array = NDArray[np.float64]

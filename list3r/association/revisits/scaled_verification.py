@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from list3r.association.revisits.keyframe_covariance import with_scale
 from list3r.association.revisits.verification import VerificationSettings, rejected, verify
-from list3r.memory.errors import DegenerateError
-from list3r.memory.geometry import Sim3, take, umeyama
-from list3r.memory.records import Edge, Keyframe
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import Sim3, take, umeyama
+from list3r.memory.core.records import Edge, Keyframe
 from list3r.reconstruction.features.local import match, rigid_fits
 
 Array = NDArray[np.float64]

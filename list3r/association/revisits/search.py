@@ -51,8 +51,8 @@ from list3r.association.revisits.joint_window import (
 from list3r.association.revisits.scaled_verification import verify_scaled
 from list3r.association.revisits.verification import VerificationSettings, verify
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, Edge, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow, Edge, Keyframe
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 

@@ -19,8 +19,8 @@ import numpy as np
 from list3r.association.graph.pose_graph import across, chain_poses
 from list3r.association.revisits.all_keyframes import WITNESSED
 from list3r.association.revisits.further_pairs import FramesApart, are_independent
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge
 
 DEFERRED = "deferred"
 """Score of a deferred relation."""

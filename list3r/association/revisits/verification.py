@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from list3r.association.revisits.keyframe_covariance import KeyframeErrorSettings, registration_covariance
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge, Keyframe
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge, Keyframe
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.local import FeaturePose, match, relative_pose
 from list3r.reconstruction.features.settings import FeatureSettings

@@ -12,7 +12,7 @@ from list3r.association.graph.solver import GraphProblem
 from list3r.association.whole_map.revisits import Revisit
 from list3r.association.whole_map.settings import DriftSettings
 from list3r.association.whole_map.views import MapView
-from list3r.memory.geometry import Sim3, stack
+from list3r.memory.core.geometry import Sim3, stack
 
 Array = NDArray[np.float64]
 

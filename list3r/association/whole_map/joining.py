@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from list3r.association.whole_map.revisits import relation
 from list3r.association.whole_map.settings import JoiningSettings, RevisitPairSettings
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.features.vlad import describe_rooted
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from list3r.association.overlap.camera_edge import ONE_FRAME
 from list3r.association.whole_map.video_map import VideoMap
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Edge
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Edge
 from list3r.memory.store.store import Store
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.association.whole_map.settings import RevisitPairSettings
 from list3r.association.whole_map.views import MapView, shared_views
 from list3r.frames.base import Camera
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.sfm.frame_poses import pose_of
 from list3r.reconstruction.sfm.keyframe_features import match_features
 

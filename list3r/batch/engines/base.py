@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from list3r.batch.work import BatchJob, Outcome
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from list3r.batch.engines.base import Engine, TaskResources
-from list3r.memory.errors import OptionError, check_choice
+from list3r.memory.core.errors import OptionError, check_choice
 
 
 def make_engine(name: str, resources: TaskResources, jobs: int | None, address: str | None) -> Engine:

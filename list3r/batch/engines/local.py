@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 
 from list3r.batch.engines.base import TaskResources
 from list3r.batch.work import BatchJob, Outcome, run_task
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.workers import TaskPool
 
 _GIB = 2**30

@@ -8,7 +8,7 @@ from typing import Any
 
 from list3r.batch.engines.base import TaskResources
 from list3r.batch.work import BatchJob, Outcome, run_task
-from list3r.memory.errors import first_line
+from list3r.memory.core.errors import first_line
 from list3r.pipeline.workers.cluster import RayCluster
 
 _GIB = 2**30

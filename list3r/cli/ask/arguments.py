@@ -73,7 +73,7 @@ class NearArguments:
 
     def origin(self) -> tuple[float, float, float] | None:
         """Return the point. Raises `OptionError` where no point, id or words are given, or an invalid point."""
-        from list3r.memory.errors import OptionError
+        from list3r.memory.core.errors import OptionError
 
         if self.words is None and self.point is None and self.id is None:
             raise OptionError("give a place: --point x,y,z, --id ID, or words such as mug")
@@ -103,7 +103,7 @@ class RegionArguments:
 
     def lengths(self, camera: CameraArguments) -> dict[str, Sequence[float] | float]:
         """Return the region, nothing for that of a camera. Raises `OptionError` unless there is one of them."""
-        from list3r.memory.errors import OptionError
+        from list3r.memory.core.errors import OptionError
 
         sphere = self.point is not None or self.radius is not None
         if (self.box is not None) + sphere + (camera.view is not None) + (camera.pose is not None) > 1:
@@ -172,7 +172,7 @@ class SimilarArguments:
 
     def corners(self) -> tuple[float, float, float, float] | None:
         """Return the box `120,80,180,150`. Raises `OptionError`."""
-        from list3r.memory.errors import OptionError
+        from list3r.memory.core.errors import OptionError
 
         if self.box is None:
             return None

@@ -77,7 +77,7 @@ def _entry(changed: Any) -> dict[str, Any]:
 
 
 def _box(box: Any) -> dict[str, Any] | None:
-    from list3r.memory.geometry import quat_wxyz_from_rotation
+    from list3r.memory.core.geometry import quat_wxyz_from_rotation
 
     if box is None:
         return None

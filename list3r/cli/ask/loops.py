@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
-    from list3r.memory.records import ChunkRow, Edge
+    from list3r.memory.core.records import ChunkRow, Edge
     from list3r.memory.store.store import Store
 
 _WIDTH = 100

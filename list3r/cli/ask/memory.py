@@ -14,8 +14,8 @@ from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, o
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
-    from list3r.memory.records import DetectedLabel, Instance, Relation
-    from list3r.memory.world.scale import Lengths
+    from list3r.memory.core.records import DetectedLabel, Instance, Relation
+    from list3r.memory.library.world.scale import Lengths
 
 _LEFT_OUT = ("beside", "units_per_metre", "metre_deviation", "gravity_deviation_deg")
 """What is not listed where there is nothing to say."""
@@ -73,15 +73,15 @@ def list_instances(
 
     Example: list3r list house.l3r --min-confidence 0.2
     """
-    from list3r.memory.errors import check_share
-    from list3r.memory.records import FIRST_SCRAP, FIRST_UNLISTED
+    from list3r.memory.core.errors import check_share
+    from list3r.memory.core.records import FIRST_SCRAP, FIRST_UNLISTED
 
     least = min_confidence or 0.0
     check_share("--min-confidence", least)
     with open_memory(memory, None if at is not None else min_confidence) as scene:
         found = scene.instances(structure=None if structure else False)
         if at is not None:
-            from list3r.memory.maintenance.history import world_at
+            from list3r.memory.library.maintenance.history import world_at
 
             found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.lengths

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from list3r.api import SceneMemory
     from list3r.cli.ask.arguments import CameraArguments
-    from list3r.memory.records import BestView, Relation
-    from list3r.memory.world.scale import Lengths
+    from list3r.memory.core.records import BestView, Relation
+    from list3r.memory.library.world.scale import Lengths
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
     from list3r.queries.views.camera import PosedCamera
@@ -67,7 +67,7 @@ MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="How far the
 
 def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | None:
     """The camera that the options name; None for none of them. Raises `OptionError`."""
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     view, time, pose, session = given.view, given.time, given.pose, given.session
     if sum(option is not None for option in (view, time, pose)) > 1:

@@ -28,7 +28,7 @@ def picture(
     from PIL import Image
 
     from list3r.exporters.output import replacing
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     out = out or Path(f"instance_{instance_id}.jpg")
     if out.suffix.lower() not in (".jpg", ".jpeg", ".png"):

@@ -99,7 +99,7 @@ def similar(
 
     Example: list3r query similar house.l3r --image mug.jpg --box 120,80,180,150
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     with open_memory(memory, filters.min_confidence, at) as scene:
         if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
@@ -149,7 +149,7 @@ def seen(
 
     Example: list3r query seen house.l3r --time 12.5
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     with open_memory(memory, at=at) as scene:
         camera = camera_from(scene, options)

@@ -96,7 +96,7 @@ def batch(
     from list3r.batch.engines.choice import make_engine
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
     from list3r.pipeline.finishing import check_run
 
     check_run(run)

@@ -66,7 +66,7 @@ def inspect(
 def _check_overlay(overlay: Path, source: Path) -> None:
     """Raises `OptionError` or `ExportError` before any work where the picture cannot or must not be written."""
     from list3r.exporters.output import check_target
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if overlay.suffix.lower() != ".png":
         raise OptionError(f"--overlay {overlay}: the picture must end in .png")

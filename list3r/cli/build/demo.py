@@ -12,7 +12,7 @@ from list3r.cli.build.progress import build_interrupted, report_lines, watching
 from list3r.cli.common import open_memory, print_table
 from list3r.cli.measure.commands import score_rows
 from list3r.cli.terminal import say
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 EXPORTS = (("json", "json"), ("usd", "usdc"), ("plan", "png"), ("glb", "glb"), ("ply", "ply"), ("tum", "txt"))

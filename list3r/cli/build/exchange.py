@@ -12,7 +12,7 @@ from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.common import JsonOption, spread
 from list3r.cli.terminal import say
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.reconstruction.outputs.base import OutputOptions

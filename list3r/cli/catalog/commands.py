@@ -47,7 +47,7 @@ def add(
 
     Example: list3r catalog add memories/ --catalog postgresql://db.example/list3r
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     found = list(_memories(files))
     if name is not None and len(found) != 1:
@@ -150,7 +150,7 @@ def _opened(url: str, *, make: bool = False) -> Catalog:
 
 def _memories(files: Sequence[str]) -> Iterator[str]:
     """Yield memory files, those in folders too. Raises `OptionError` for a folder without any."""
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     for file in files:
         if "://" in file or not Path(file).is_dir():

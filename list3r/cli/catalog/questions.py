@@ -66,7 +66,7 @@ def with_catalog(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _option_error(text: str) -> Exception:
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     return OptionError(text)
 

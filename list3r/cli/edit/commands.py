@@ -14,7 +14,7 @@ from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
-    from list3r.memory.maintenance.edits import EditReport
+    from list3r.memory.library.maintenance.edits import EditReport
 
 IdArgument = Annotated[
     int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
@@ -33,7 +33,7 @@ def merges(
 
     Example: list3r merges house.l3r 12
     """
-    from list3r.memory.maintenance.merge_log import states
+    from list3r.memory.library.maintenance.merge_log import states
 
     with open_memory(memory) as scene, scene.store.snapshot():
         entries = scene.merges(instance_id)
@@ -159,7 +159,7 @@ def _run_edit(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool)
 
 def _parse_parts(text: str) -> list[tuple[int, int]]:
     """`3:4,5:2` as pairs. Raises `OptionError`."""
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     try:
         pairs = [part.split(":") for part in text.split(",")]

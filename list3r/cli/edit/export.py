@@ -61,7 +61,7 @@ class ExportArguments:
 
 
 def _ids(text: str) -> tuple[int, ...]:
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if not all(word.strip().isdecimal() for word in text.split(",")):
         raise OptionError(f"--ids {text}: give numbers separated by commas, such as 3,7,12")
@@ -91,7 +91,7 @@ def export(
 
     Example: list3r export house.l3r --to usd --out house.usdc
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     options = words.given()
     if out == Path("-"):
@@ -124,7 +124,7 @@ def _size_text(size: int) -> str:
 
 def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
     """Write the first file of a format to standard output, once it is whole. Raises `OptionError` for a folder."""
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     form = find_format(to)
     if form.folder:

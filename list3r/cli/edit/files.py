@@ -17,7 +17,7 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
 
     Example: list3r verify house.l3r
     """
-    from list3r.memory.errors import MemoryFileError
+    from list3r.memory.core.errors import MemoryFileError
 
     found, state, chunks, leftovers = [], [], None, None
     try:
@@ -73,7 +73,7 @@ def repair(
 
     Example: list3r repair house.l3r
     """
-    from list3r.memory.maintenance.repair import repair as salvage
+    from list3r.memory.library.maintenance.repair import repair as salvage
 
     report = salvage(memory, out)
     if json:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from list3r.evaluation.cloud import CloudErrors
     from list3r.evaluation.point_clouds import PointCloud
     from list3r.evaluation.trajectory import Trajectory
-    from list3r.memory.geometry import Sim3
+    from list3r.memory.core.geometry import Sim3
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ def _cloud_alignment(
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register
     from list3r.evaluation.scene import alignment_of
-    from list3r.memory.errors import OptionError
-    from list3r.memory.geometry import Sim3
+    from list3r.memory.core.errors import OptionError
+    from list3r.memory.core.geometry import Sim3
 
     (true, true_path, source), (found, estimate_path) = truth, estimate
     by_source = asked.align is None and is_source(source) and true_path is not None
@@ -174,7 +174,7 @@ def _normals(points: PointCloud) -> Any:
 def _check_lengths(**lengths: float | None) -> None:
     import math
 
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     for name, value in lengths.items():
         if value is not None and not (math.isfinite(value) and value > 0):

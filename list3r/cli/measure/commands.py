@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from list3r.evaluation.trajectory import Trajectory
-    from list3r.memory.geometry import Sim3
+    from list3r.memory.core.geometry import Sim3
 
 
 # ---------------------------------------------------------------------------------------------- trajectory
@@ -65,7 +65,7 @@ def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryArguments, jso
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
     """
     from list3r.evaluation.trajectory import Delta, evaluate_trajectory
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     tolerance = asked.tolerance
     check_scale(asked.scale)
@@ -143,7 +143,7 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: 
     Example: list3r eval instances walk/truth.json rooms.l3r --plot found.png
     """
     from list3r.evaluation.scene import evaluate_scene, read_scene
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     align = asked.align
     if align not in (None, "none") and estimate.is_file() and not is_database(estimate):
@@ -184,7 +184,7 @@ def _identities(
 ) -> dict[str, Any] | None:
     """Id switches, None where there are no true ids of pixels or the estimate has no masks."""
     from list3r.evaluation.identity import evaluate_identities
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     folder = ids or truth.parent / "ids"
     if ids is not None and not ids.is_dir():

@@ -11,7 +11,7 @@ from importlib import metadata
 
 import apsw
 
-from list3r.memory.errors import first_line
+from list3r.memory.core.errors import first_line
 from list3r.models.cache import cache_folder, find_cached
 from list3r.models.cards import CARDS, ModelCard
 from list3r.models.device import find_gpu

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from list3r.evaluation.point_clouds import PointCloud
     from list3r.evaluation.trajectory import Trajectory
     from list3r.frames.base import Camera
-    from list3r.memory.geometry import Sim3
+    from list3r.memory.core.geometry import Sim3
     from list3r.memory.store.store import Store
 
 _SOURCES = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".r3d", ".sens", ".bag", ".mcap", ".db3", ".vrs")
@@ -60,7 +60,7 @@ def _stored(path: Path) -> Trajectory:
     import numpy as np
 
     from list3r.evaluation.trajectory import Trajectory
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     with open_memory(path) as scene:
         parts: dict[tuple[int, int], list[Any]] = {}
@@ -87,7 +87,7 @@ def _given(path: Path) -> Trajectory:
 
     from list3r.evaluation.trajectory import Trajectory
     from list3r.frames.source import open_source
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     source = open_source(path)
     read = getattr(source, "read_poses", None)
@@ -127,7 +127,7 @@ def read_depth_frames(path: Path, every: int | None, width: int) -> DepthFrames:
     from list3r.frames.base import Frame
     from list3r.frames.options import SourceOptions
     from list3r.frames.source import open_source, require_camera
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     info = open_source(path, SourceOptions(every=every or 1)).info
     if not info.has_poses or not info.has_depth:
@@ -203,7 +203,7 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
 
     from list3r.evaluation.point_clouds import PointCloud
     from list3r.exporters.components import read_components
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     with open_memory(path) as scene:
         main = read_components(scene.store)[0]
@@ -243,8 +243,8 @@ def mask_frames(store: Store, ids_folder: Path, every: int) -> Iterator[tuple[An
     import numpy as np
 
     from list3r.frames.decoding.decode import read_raw_depth
-    from list3r.memory.errors import FrameError, SourceError
-    from list3r.memory.masks import decode_mask
+    from list3r.memory.core.errors import FrameError, SourceError
+    from list3r.memory.core.masks import decode_mask
 
     tracks = [
         (o.instance_id, store.local_instances.mask_track(o.chunk_id, o.local_id)) for o in store.observations.all()

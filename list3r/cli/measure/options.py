@@ -39,7 +39,7 @@ def share(value: float | None) -> str:
 
 def check_scale(scale: str) -> None:
     """Raises `OptionError` for a scale that is none of the choices."""
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if scale not in ("auto", "free", "fixed"):
         raise OptionError(f"--scale {scale}: use auto, free or fixed")
@@ -47,7 +47,7 @@ def check_scale(scale: str) -> None:
 
 def check_every(every: int | None) -> None:
     """Raises `OptionError` for an `--every` below 1."""
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if every is not None and every < 1:
         raise OptionError(f"--every {every}: must be at least 1")

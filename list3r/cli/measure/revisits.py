@@ -66,7 +66,7 @@ def revisits(
     from list3r.evaluation.covisibility import write_covisibility
     from list3r.evaluation.revisits import Candidates, RevisitTruthSettings, judge, score
     from list3r.exporters.output import check_target, replacing
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     settings = RevisitTruthSettings(asked.least, asked.different, asked.precision)
     check_every(asked.every)
@@ -108,7 +108,7 @@ def _check_clock(path: Path, frame: Any, time_s: Any, times: dict[int, float]) -
     """Raises `OptionError` when the truth's frames are not the memory's."""
     import numpy as np
 
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     gaps = [abs(times[int(k)] - float(t)) for k, t in zip(frame, time_s, strict=True) if int(k) in times]
     if not gaps:

@@ -42,7 +42,7 @@ def detect(
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if source is None and given != src.SourceArguments():
         raise OptionError("options of a video, such as --every, need the video: --source SOURCE")

@@ -39,13 +39,13 @@ def mcp(
 
     Example: list3r mcp house.l3r --http
     """
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if (memory is None) == (catalog is None):
         raise OptionError("give either a memory or --catalog URL, such as: list3r mcp house.l3r")
     if catalog is not None and write:
         raise OptionError("--write needs a memory; a catalogue cannot be edited")
-    from list3r.server.app import HttpSettings, serve_http, serve_stdio
+    from list3r.server.mcp.app import HttpSettings, serve_http, serve_stdio
 
     with _opened(memory, catalog, write=write) as served:
         if not http:
@@ -87,7 +87,7 @@ def ask_config(
     Example: list3r ask-config house.l3r --client vscode
     """
     from list3r.api import open as open_scene
-    from list3r.server.clients import config_entry
+    from list3r.server.mcp.clients import config_entry
 
     open_scene(memory).close()
     file, text = config_entry(Path(memory), client, write=write)

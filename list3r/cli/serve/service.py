@@ -33,8 +33,8 @@ def serve(
 
     Example: list3r serve --catalog postgresql://db.example/list3r --workers 4
     """
-    from list3r.memory.errors import OptionError
-    from list3r.service.tokens import make_token
+    from list3r.memory.core.errors import OptionError
+    from list3r.server.http.tokens import make_token
 
     secret = os.environ.get(SECRET_VARIABLE)
     if hours is not None:
@@ -44,9 +44,9 @@ def serve(
         return
     known, secret = secret is not None, secret or secrets.token_urlsafe(32)
     token = make_token(secret, _FIRST_TOKEN_HOURS)
-    from list3r.service.limits import ServiceLimits
-    from list3r.service.running import ServiceAddress
-    from list3r.service.running import serve as run
+    from list3r.server.http.limits import ServiceLimits
+    from list3r.server.http.running import ServiceAddress
+    from list3r.server.http.running import serve as run
 
     def started(address: str) -> None:
         note(address)

@@ -24,7 +24,7 @@ def view(
     Example: list3r view house.l3r
     """
     from list3r.api import open as open_scene
-    from list3r.memory.errors import OptionError
+    from list3r.memory.core.errors import OptionError
 
     if not 0 < port <= 65535:
         raise OptionError(f"--port {port} must be between 1 and 65535")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.exporters.cameras.pictures import PosedPicture, colored_points, write_pictures
 from list3r.exporters.components import read_components
 from list3r.exporters.output import replacing_folder, units
-from list3r.memory.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.geometry import quat_wxyz_from_rotation
 from list3r.memory.store.store import Store
 
 

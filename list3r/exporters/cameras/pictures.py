@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.exporters.components import Component, thinned_support
-from list3r.memory.records import ChunkRow
+from list3r.memory.core.records import ChunkRow
 from list3r.memory.store.store import Store
 
 _JPEG_SIZES = range(0xC0, 0xD0)

@@ -11,7 +11,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from list3r.exporters.components import has_box, point_spacing, thinned_support
 from list3r.exporters.meshes.closed import ClosedSurface, divided, filled, hull, outward, slab, zero_level
-from list3r.memory.records import Instance, Support
+from list3r.memory.core.records import Instance, Support
 from list3r.memory.store.store import Store
 
 Array = NDArray[np.float64]

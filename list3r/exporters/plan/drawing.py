@@ -26,12 +26,12 @@ from list3r.exporters.plan.loops import loop_ends
 from list3r.exporters.plan.raster import picture_from_above
 from list3r.exporters.plan.view import PlanView, choose_view, is_wall
 from list3r.exporters.tags import TagTarget, place_tags
-from list3r.memory.description.printable import shown
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.core.description.printable import shown
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance
+from list3r.memory.library.world.gravity import gravity_of
+from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import gravity_of
-from list3r.memory.world.scale import lengths_of
 
 _INK, _GREY, _LINE = "#262a34", "#787c86", "#cdcfd4"
 _START, _END, _LOOP = "#168c64", "#c43048", "#7654be"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from list3r.exporters.components import point_spacing
 from list3r.exporters.plan.view import PlanView
-from list3r.memory.records import Support
+from list3r.memory.core.records import Support
 
 LONG_SIDE_PX = 1100
 """Pixels of the longer side of the map."""

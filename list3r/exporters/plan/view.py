@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.exporters.components import Component, has_box
-from list3r.memory.records import Instance, Support
+from list3r.memory.core.records import Instance, Support
 
 Array = NDArray[np.float64]
 FLAT_KINDS = ("floor", "ceiling")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from list3r.exporters.prompt.scene_text import name_of
-from list3r.memory.records import Instance
+from list3r.memory.core.records import Instance
 
 GRIDS = (10, 20)
 """Cells along a side."""

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from list3r.exporters.palette import Color, instance_color
 from list3r.exporters.tags import TagTarget, place_tags
-from list3r.memory.masks import decode_mask
+from list3r.memory.core.masks import decode_mask
 from list3r.queries.pictures import InstanceSight, mask_border
 
 

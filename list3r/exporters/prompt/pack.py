@@ -17,7 +17,7 @@ from list3r.exporters.prompt.cognitive_map import cognitive_maps
 from list3r.exporters.prompt.coverage import cover
 from list3r.exporters.prompt.marks import draw_marks
 from list3r.exporters.prompt.scene_text import scene_prompt
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.queries.pictures import KeyframePicture
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from list3r.exporters.prompt.budget import Budget
-from list3r.memory.description.printable import shown, shown_between
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance, Relation
+from list3r.memory.core.description.printable import shown, shown_between
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance, Relation
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from list3r.exporters.output import replacing
-from list3r.memory.description.printable import shown
-from list3r.memory.errors import OptionError
+from list3r.memory.core.description.printable import shown
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
-    from list3r.memory.records import Instance
+    from list3r.memory.core.records import Instance
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from list3r.exporters.simready.prop import Prop, PropFacts
 from list3r.exporters.usd.labels import set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind
 from list3r.exporters.usd.stage import errors_of_disk
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
-from list3r.memory.records import Instance
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
+from list3r.memory.core.records import Instance
+from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
-from list3r.memory.world.scale import lengths_of
 
 
 @dataclass(frozen=True)

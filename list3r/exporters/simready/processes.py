@@ -10,7 +10,7 @@ from pathlib import Path
 from list3r.exporters.components import thinned_support
 from list3r.exporters.meshes.instance_mesh import MeshSettings, mesh_of
 from list3r.exporters.simready.prop import Prop, PropFacts, write_prop
-from list3r.memory.records import Instance, Support
+from list3r.memory.core.records import Instance, Support
 from list3r.memory.store.store import Store
 from list3r.pipeline.workers import OrderedPool, default_workers
 

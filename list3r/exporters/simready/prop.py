@@ -17,8 +17,8 @@ from list3r.exporters.meshes.instance_mesh import InstanceMesh
 from list3r.exporters.simready.thumbnail import thumbnail
 from list3r.exporters.usd.labels import class_token, set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import Instance
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import Instance
 
 _NOT_STATED = "unknown"
 

@@ -6,8 +6,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from list3r.exporters.components import Component, frames_per_second
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
-from list3r.memory.records import FrameRow
+from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
+from list3r.memory.core.records import FrameRow
 from list3r.memory.store.store import Store
 
 USD_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])

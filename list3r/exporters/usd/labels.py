@@ -6,8 +6,8 @@ import re
 
 from pxr import Sdf, Usd
 
-from list3r.memory.description.coco import COCO_80
-from list3r.memory.records import Instance
+from list3r.memory.core.description.coco import COCO_80
+from list3r.memory.core.records import Instance
 
 
 def set_labels(prim: Usd.Prim, instance: Instance) -> None:

@@ -9,7 +9,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from list3r.exporters.meshes.instance_mesh import InstanceMesh
 from list3r.exporters.palette import linear_from_srgb
 from list3r.exporters.usd.labels import set_token
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 
 def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: InstanceMesh, T_world_prim: Sim3) -> UsdGeom.Mesh:

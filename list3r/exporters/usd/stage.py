@@ -20,9 +20,9 @@ from list3r.exporters.palette import instance_color, linear_from_srgb
 from list3r.exporters.usd.camera import add_cameras, set_time_range
 from list3r.exporters.usd.labels import class_token, set_labels
 from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind, set_vertex_colors
-from list3r.memory.errors import ExportError, OptionError
-from list3r.memory.geometry import Sim3, quat_wxyz_from_rotation
-from list3r.memory.records import Instance, Support
+from list3r.memory.core.errors import ExportError, OptionError
+from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
+from list3r.memory.core.records import Instance, Support
 from list3r.memory.store.store import Store
 
 

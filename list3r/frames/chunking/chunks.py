@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 
 @dataclass(frozen=True)

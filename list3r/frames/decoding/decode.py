@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from list3r.frames.files import MAX_PIXELS, read_file, too_many_pixels
 from list3r.frames.recordings.exr import read_exr
 from list3r.frames.recordings.stored import CodedArray, Stored
-from list3r.memory.errors import FrameError
+from list3r.memory.core.errors import FrameError
 
 
 def read_color(path: Stored, bits: int = 16, *, upright: bool = True) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 MOST_ENTRIES = 8_000_000
 """Of the tables of all tracks together: three days of pictures at 30 a second. FFmpeg takes 40 bytes for each."""

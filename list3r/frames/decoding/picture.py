@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame
-from list3r.memory.errors import FrameError
+from list3r.memory.core.errors import FrameError
 
 
 def gray_of(frame: Frame) -> NDArray[np.uint8]:

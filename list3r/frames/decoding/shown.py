@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _BLACK, _SEEN = 24, 48
 """Brightest value of a bar, with the noise of its compression, and least value of a picture beside it, of 255."""

@@ -18,7 +18,7 @@ from list3r.frames.beside import role_of
 from list3r.frames.decoding.mp4_boxes import check_index
 from list3r.frames.files import MAX_PIXELS
 from list3r.frames.folder import DEFAULT_FPS
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _NOT_VIDEO = ("tty", "image2", "_pipe", "gif_pipe")
 _PLAYLISTS = ("hls", "concat", "dash", "sdp", "rtsp", "imf")

@@ -9,7 +9,7 @@ from pathlib import Path
 from list3r.frames.live.feed import FeedState, LiveSettings
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 
 class FolderFeed:

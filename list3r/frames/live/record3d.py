@@ -20,7 +20,7 @@ from list3r.frames.live.camera import LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.usbmux import connect, receive
 from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS
-from list3r.memory.errors import OptionError, SourceError, install_hint
+from list3r.memory.core.errors import OptionError, SourceError, install_hint
 
 PORT = 1337
 _VARIES = 0.01

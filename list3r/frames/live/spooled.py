@@ -17,7 +17,7 @@ from pathlib import Path
 from list3r.frames.live.camera import LiveCamera, LivePicture, LostError
 from list3r.frames.live.feed import FeedState, LiveSettings, Tell
 from list3r.frames.readers.spool import FOLDER, LIST
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _MOST_WAITING = 300
 """Before it is known how long chunks are."""

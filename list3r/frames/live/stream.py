@@ -15,7 +15,7 @@ from list3r.frames.live.camera import LiveCamera, LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.record3d import Record3dPhone
 from list3r.frames.writers.pictures import jpeg
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 
 def open_camera(source: str, tell: Tell) -> LiveCamera:

@@ -17,7 +17,7 @@ from xml.parsers.expat import ExpatError
 
 from list3r import __version__
 from list3r.frames.live.camera import LostError
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 ADDRESS = "USBMUXD_SOCKET_ADDRESS"
 _USUAL = "127.0.0.1:27015" if sys.platform == "win32" else "UNIX:/var/run/usbmuxd"

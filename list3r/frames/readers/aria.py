@@ -28,7 +28,7 @@ from list3r.frames.recordings.aria_trajectory import DeviceTrajectory, read_traj
 from list3r.frames.recordings.axes import quarter_turns
 from list3r.frames.registration.rig import WORKING_SIDES
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError, first_line, install_hint
+from list3r.memory.core.errors import FrameError, OptionError, SourceError, first_line, install_hint
 
 COLOR, DEPTH = "214-1", "345-1"
 """Streams of the colour camera and, in a file of its own, of the Digital Twin's depth on its pixels."""

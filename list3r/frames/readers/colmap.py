@@ -25,7 +25,7 @@ from list3r.frames.layout import (
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.colmap_files import frames_are_whole, written_sizes
-from list3r.memory.errors import OptionError, SourceError, first_line
+from list3r.memory.core.errors import OptionError, SourceError, first_line
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 _FOLDERS = ("images", "rgb", "color", ".")

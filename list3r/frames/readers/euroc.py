@@ -24,7 +24,7 @@ from list3r.frames.layout import (
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.readers.tum import poses_at
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0", "gt")
 _POSE_COLUMNS = 8

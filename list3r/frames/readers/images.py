@@ -18,7 +18,7 @@ from list3r.frames.readers.tum import poses_at
 from list3r.frames.recordings.camera_files import StatedCamera, read_camera
 from list3r.frames.recordings.pose_lists import PoseList, read_pose_list
 from list3r.frames.recordings.stamps import times_of_names
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _POSE_FILES = re.compile(r"(\w+_)?(poses|traj|trajectory|groundtruth)\.(txt|csv|log)|.*\.(log|traj)", re.IGNORECASE)
 _POSE_FOLDERS = ("pose", "poses")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import BadFrame, Frame, Reader
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.video import VideoSource
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 
 class JoinedVideos(Reader):

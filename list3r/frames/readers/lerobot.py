@@ -25,7 +25,7 @@ from list3r.frames.readers.video import VideoSource
 from list3r.frames.recordings.depth_code import DepthCode, bits_of, metres_of
 from list3r.frames.recordings.lerobot_tables import INFO, Episode, read_episode, read_features
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig, merge_optics
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
 
 _LATE = 0.5
 """Frames by which the times of a video may differ from those of the table."""

@@ -28,7 +28,7 @@ from list3r.frames.layout import (
 from list3r.frames.listing import POSE, FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion, check_intrinsics
 from list3r.frames.recordings.axes import OPENGL_TO_OPENCV
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "")
 _FISHEYE = "OPENCV_FISHEYE"

@@ -18,7 +18,7 @@ from list3r.frames.layout import (
 )
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 _NICE_SLAM: Intrinsics = (600.0, 600.0, 599.5, 339.5)
 _SCALE = 6553.5

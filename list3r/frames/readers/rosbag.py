@@ -29,7 +29,7 @@ from list3r.frames.recordings.ros_images import camera_of, is_depth, read_color,
 from list3r.frames.recordings.ros_transforms import DRIFTING, TransformTree
 from list3r.frames.registration.rig import build_rig, merge_optics
 from list3r.frames.selection import select
-from list3r.memory.errors import FrameError, OptionError, SourceError, first_line, install_hint
+from list3r.memory.core.errors import FrameError, OptionError, SourceError, first_line, install_hint
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -18,7 +18,7 @@ from list3r.frames.layout import FolderLayout, Optics, natural_key, pose_matrix,
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.recordings.stored import CodedArray, FileSlice
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _VERSION = 4
 _MATRIX = struct.Struct("<16f")

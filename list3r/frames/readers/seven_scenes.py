@@ -14,7 +14,7 @@ import numpy as np
 from list3r.frames.layout import FolderLayout, Optics, natural_key, read_numbers
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _COLOR = re.compile(r"^frame-(\d+)\.color\.(png|jpg|jpeg)$", re.IGNORECASE)
 KINECT_NOMINAL: Intrinsics = (585.0, 585.0, 320.0, 240.0)

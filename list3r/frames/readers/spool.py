@@ -13,7 +13,7 @@ from list3r.frames.layout import FolderLayout, Optics, inside, read_json, read_l
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.phones.record3d import METADATA, PhoneCamera, pose_of_row
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 LIST = "frames.txt"
 FOLDER = "rgb"

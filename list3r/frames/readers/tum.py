@@ -29,7 +29,7 @@ from list3r.frames.layout import (
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
 from list3r.frames.recordings.stamps import as_seconds
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 MAX_PAIR_GAP_S = 0.02
 """Colour and depth this far apart still make a frame (the benchmark's own tools)."""

@@ -22,7 +22,7 @@ from list3r.frames.layout import Optics
 from list3r.frames.options import SourceOptions
 from list3r.frames.registration.rig import Rig, build_rig
 from list3r.frames.selection import select, sharpness
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
 
 _MEASURED_PX, _THUMBNAIL_PX, _LOOKED_AT_PX = 320, 160, 640
 _LOOKED = 360

@@ -22,7 +22,7 @@ from list3r.frames.recordings.axes import lying_note, turns_in_gravity
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.frames.registration.rig import WORKING_SIDES, build_rig
 from list3r.frames.unread import not_read, not_read_note
-from list3r.memory.errors import FrameError
+from list3r.memory.core.errors import FrameError
 
 _FRAMES_TRIED = 12
 

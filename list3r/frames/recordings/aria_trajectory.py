@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from list3r.frames.files import check_ordinary
 from list3r.frames.readers.tum import poses_at
 from list3r.frames.recordings.axes import pose_of_quaternion
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _MOST_BYTES = 2**36
 """Of a trajectory; it is read row by row."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from list3r.frames.layout import read_calibration, read_json, read_numbers, read_text
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 _JSON = (
     *("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json", "intrinsics.json", "camera.json"),

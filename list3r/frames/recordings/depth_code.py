@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 if TYPE_CHECKING:
     import av

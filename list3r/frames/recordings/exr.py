@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import MAX_PIXELS
-from list3r.memory.errors import FrameError
+from list3r.memory.core.errors import FrameError
 
 _MAGIC = b"v/1\x01"
 _LINES = {0: 1, 1: 1, 2: 1, 3: 16}

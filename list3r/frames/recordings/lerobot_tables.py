@@ -11,7 +11,7 @@ import numpy as np
 
 from list3r.frames.files import MAX_TEXT_BYTES, check_ordinary
 from list3r.frames.layout import inside, read_json
-from list3r.memory.errors import OptionError, SourceError, first_line, install_hint
+from list3r.memory.core.errors import OptionError, SourceError, first_line, install_hint
 
 INFO = "meta/info.json"
 _VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.layout import MAX_LENGTH_M, pose_matrix, read_lines
 from list3r.frames.recordings.stamps import as_seconds
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 
 _TUM = "time_s tx ty tz qx qy qz qw"
 _MOST_OFF = 0.05

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
 from list3r.frames.recordings.rvl import read_rvl
-from list3r.memory.errors import FrameError, SourceError
+from list3r.memory.core.errors import FrameError, SourceError
 
 DEPTH_ENCODINGS = {"16UC1": "<u2", "mono16": "<u2", "32FC1": "<f4"}
 """Encodings of depth (REP 118): millimetres as whole numbers, metres as floats."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from list3r.compiled import compiled
 from list3r.frames.files import MAX_PIXELS
-from list3r.memory.errors import FrameError
+from list3r.memory.core.errors import FrameError
 
 
 def read_rvl(data: bytes) -> NDArray[np.uint16]:

@@ -15,8 +15,8 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import FrameError, OptionError, install_hint
-from list3r.memory.unpacking import open_archive
+from list3r.memory.core.errors import FrameError, OptionError, install_hint
+from list3r.memory.core.unpacking import open_archive
 
 MOST_BYTES = 256 * 2**20
 """Largest member that is unpacked; a depth image of 30 megapixels is half of it."""

@@ -21,7 +21,7 @@ from list3r.frames.folder import FolderSource
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.registration.edge_fit import Array, EdgeFit
 from list3r.frames.source import open_source
-from list3r.memory.errors import FrameError, SourceError
+from list3r.memory.core.errors import FrameError, SourceError
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Frame, FrameSource
 from list3r.frames.registration.edges import depth_edges
-from list3r.memory.errors import ExportError, SourceError
+from list3r.memory.core.errors import ExportError, SourceError
 
 _RED = (230, 20, 20)
 

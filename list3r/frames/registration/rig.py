@@ -16,7 +16,7 @@ from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.registration.reprojection import DepthReprojection, Undistortion
 from list3r.frames.selection import working_size
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
 
 
 def merge_optics(layout: FolderLayout, options: SourceOptions) -> tuple[Optics, tuple[str, ...]]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from list3r.frames.base import Camera, Frame
 from list3r.frames.recordings.axes import arkit_of_pose
 from list3r.frames.writers.pictures import jpeg
-from list3r.memory.errors import OptionError, install_hint
+from list3r.memory.core.errors import OptionError, install_hint
 
 SURE = 2
 """Confidence of depth that is known (stored 0, 1, 2)."""

@@ -31,10 +31,10 @@ from list3r.instances.carving.carved_surfaces import (
 from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE
-from list3r.memory.geometry import Array, Sim3
-from list3r.memory.masks import encode_mask
-from list3r.memory.overlap.visibility import DepthView, views_of
-from list3r.memory.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
+from list3r.memory.core.geometry import Array, Sim3
+from list3r.memory.core.masks import encode_mask
+from list3r.memory.core.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
+from list3r.memory.library.overlap.visibility import DepthView, views_of
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.local_instances import LocalNode
 

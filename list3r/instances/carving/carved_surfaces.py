@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.cloud import pack
-from list3r.memory.geometry import Array
-from list3r.memory.overlap.point_verdicts import FREE, MET
-from list3r.memory.overlap.visibility import DepthView, VisibilitySettings, point_visibility
+from list3r.memory.core.geometry import Array
+from list3r.memory.library.overlap.point_verdicts import FREE, MET
+from list3r.memory.library.overlap.visibility import DepthView, VisibilitySettings, point_visibility
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

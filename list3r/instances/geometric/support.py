@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.cloud import pack
 from list3r.instances.geometric.views import ChunkViews
-from list3r.memory.records import Support
+from list3r.memory.core.records import Support
 
 
 def collect_supports(

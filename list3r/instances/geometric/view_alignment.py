@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.instances.geometric.fusion import View
-from list3r.memory.geometry import rotation_exp, rotation_log
+from list3r.memory.core.geometry import rotation_exp, rotation_log
 
 Pose = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.features import COLOR_PART, color_feature
 from list3r.instances.settings import InstanceSettings
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.base import Reconstruction
 from list3r.reconstruction.precomputed import open_folder
 from list3r.reconstruction.precomputed_files import Piece, read_piece

@@ -12,7 +12,7 @@ from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.reprojection import LabelledChunk
-from list3r.memory.records import LocalInstance
+from list3r.memory.core.records import LocalInstance
 
 
 def low_confidence_instances(

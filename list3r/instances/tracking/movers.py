@@ -14,7 +14,7 @@ from list3r.instances.geometric.fusion import small_color
 from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE, MoverInstanceSettings
 from list3r.instances.tracking.reprojection import encode_labels
-from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, MotionTrack, Support
+from list3r.memory.core.records import LocalInstance, LocalLibrary, MaskTrack, MotionTrack, Support
 from list3r.reconstruction.base import Reconstruction, backproject
 from list3r.reconstruction.motion.free_space import SmallFrames
 from list3r.reconstruction.motion.tracks import Blob, measure_blob, middles

@@ -19,7 +19,7 @@ from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.separation import cannot_link_pairs
 from list3r.instances.settings import InstanceSettings
 from list3r.instances.tracking.joining import join_candidates, warp_labels
-from list3r.memory.records import LocalInstance, LocalLibrary, MaskTrack, Support
+from list3r.memory.core.records import LocalInstance, LocalLibrary, MaskTrack, Support
 from list3r.reconstruction.base import Reconstruction
 
 Ints = NDArray[np.int64]

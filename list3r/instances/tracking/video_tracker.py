@@ -20,7 +20,7 @@ from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews, chunk_views
 from list3r.instances.settings import InstanceSettings, VideoTrackerSettings
 from list3r.instances.tracking.reprojection import LabelledChunk
-from list3r.memory.records import LocalLibrary
+from list3r.memory.core.records import LocalLibrary
 from list3r.models.images import InputShape, network_input, sam_input
 from list3r.models.pretrained import load_named
 from list3r.reconstruction.base import Reconstruction

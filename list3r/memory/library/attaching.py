@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from list3r.memory.core.records import Instance, Observation
 from list3r.memory.library.evidence import Evidence, weigh
 from list3r.memory.library.grouping import Group
 from list3r.memory.library.instances import Members, derived_instance
+from list3r.memory.library.merging.edges import NONE, links_of
+from list3r.memory.library.merging.nodes import Nodes
+from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
+from list3r.memory.library.relations.structure import flagged_only
 from list3r.memory.library.rows import record_of
 from list3r.memory.library.rules import ConsolidationReport
 from list3r.memory.library.scene import Scene
 from list3r.memory.library.uncertainty import position_sigma
-from list3r.memory.merging.edges import NONE, links_of
-from list3r.memory.merging.nodes import Nodes
-from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
-from list3r.memory.records import Instance, Observation
-from list3r.memory.relations.structure import flagged_only
 
 _COMPARED = 12
 """Chunks with which a new one is compared: those that saw most of the instances that lie where it looked."""

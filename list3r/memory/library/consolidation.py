@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from list3r.memory.library.attaching import attach
 from list3r.memory.library.derivation import derive
+from list3r.memory.library.overlap.summaries import chunk_summaries
 from list3r.memory.library.rules import (
     WORLD,
     ConsolidationReport,
@@ -18,7 +19,6 @@ from list3r.memory.library.rules import (
 )
 from list3r.memory.library.scene import Scene
 from list3r.memory.library.writing import read_known, write_library
-from list3r.memory.overlap.summaries import chunk_summaries
 from list3r.memory.store.store import Store
 
 __all__ = ["ConsolidationReport", "ConsolidationSettings", "consolidate"]

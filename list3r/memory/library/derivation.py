@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.core.records import Instance, MergeDecision, Relation
 from list3r.memory.library.evidence import Evidence, contested, weigh, without_missed
 from list3r.memory.library.grouping import Group, Groups, chunks_of, group
 from list3r.memory.library.identities import Identities, assign_ids
 from list3r.memory.library.instances import DerivedInstance, Members, derived_instance
+from list3r.memory.library.overlap.pair_scores import Key, PairScores
 from list3r.memory.library.redundancy import Redundant, find_redundant
 from list3r.memory.library.relating import relate, with_structure
 from list3r.memory.library.rows import record_of
@@ -24,8 +26,6 @@ from list3r.memory.library.scene import Scene
 from list3r.memory.library.scores import Pair
 from list3r.memory.library.session_changes import SessionChanges, find_session_changes
 from list3r.memory.library.uncertainty import position_sigmas
-from list3r.memory.overlap.pair_scores import Key, PairScores
-from list3r.memory.records import Instance, MergeDecision, Relation
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.library.overlap.missed import MissedSettings, frames_beside, misses, pictures_confirm
+from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
+from list3r.memory.library.overlap.voxels import ChunkShapes, Ints
 from list3r.memory.library.uncertainty import OF_COMPUTED_DEPTH, ConfidenceWeights, Signs, signs_of
-from list3r.memory.overlap.missed import MissedSettings, frames_beside, misses, pictures_confirm
-from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
-from list3r.memory.overlap.voxels import ChunkShapes, Ints
 
 
 @dataclass(frozen=True)

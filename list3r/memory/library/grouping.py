@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from list3r.memory.core.records import MergeDecision
+from list3r.memory.library.merging.edges import form_groups, links_of
+from list3r.memory.library.merging.movers import Mover, join_movers
+from list3r.memory.library.merging.nodes import Nodes
+from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
 from list3r.memory.library.scene import Scene
 from list3r.memory.library.scores import Pair
-from list3r.memory.merging.edges import form_groups, links_of
-from list3r.memory.merging.movers import Mover, join_movers
-from list3r.memory.merging.nodes import Nodes
-from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
-from list3r.memory.records import MergeDecision
 
 Group = tuple[Key, ...]
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.colors import Swatch, dominant_colors
-from list3r.memory.description.describe import shape_word
-from list3r.memory.geometry import Array, OrientedBox, Sim3
-from list3r.memory.merging.movers import Mover
-from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.overlap.voxels import ChunkShapes
-from list3r.memory.records import BestView
-from list3r.memory.relations.instance_geometry import InstanceGeometry, fit_box, without_strays
+from list3r.memory.core.description.colors import Swatch, dominant_colors
+from list3r.memory.core.description.describe import shape_word
+from list3r.memory.core.geometry import Array, OrientedBox, Sim3
+from list3r.memory.core.records import BestView
+from list3r.memory.library.merging.movers import Mover
+from list3r.memory.library.overlap.pair_scores import Key
+from list3r.memory.library.overlap.voxels import ChunkShapes
+from list3r.memory.library.relations.instance_geometry import InstanceGeometry, fit_box, without_strays
 
 
 @dataclass(frozen=True)

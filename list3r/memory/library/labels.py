@@ -12,9 +12,9 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from list3r.memory.constraints import Key
-from list3r.memory.records import DetectedLabel, Instance, Votes
-from list3r.memory.settings import stored_settings
+from list3r.memory.core.constraints import Key
+from list3r.memory.core.records import DetectedLabel, Instance, Votes
+from list3r.memory.core.settings import stored_settings
 from list3r.memory.store.store import Store
 
 _SCORES = (0.02, 0.98)

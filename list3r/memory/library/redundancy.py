@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from list3r.memory.library.merging.edges import NONE, links_of
+from list3r.memory.library.merging.nodes import Nodes
+from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
+from list3r.memory.library.overlap.voxels import Ints
 from list3r.memory.library.scene import Scene
-from list3r.memory.merging.edges import NONE, links_of
-from list3r.memory.merging.nodes import Nodes
-from list3r.memory.overlap.pair_scores import Key, Numbering, PairScores, PairTable
-from list3r.memory.overlap.voxels import Ints
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.geometry import Array
+from list3r.memory.core.geometry import Array
+from list3r.memory.core.records import Relation
 from list3r.memory.library.grouping import Group, chunks_of
 from list3r.memory.library.instances import DerivedInstance
+from list3r.memory.library.relations.instance_geometry import InstanceGeometry
+from list3r.memory.library.relations.predicates import relations
+from list3r.memory.library.relations.scene import PairMeasures
+from list3r.memory.library.relations.structure import classify_structure, flagged_only, is_level
 from list3r.memory.library.scene import Scene
-from list3r.memory.records import Relation
-from list3r.memory.relations.instance_geometry import InstanceGeometry
-from list3r.memory.relations.predicates import relations
-from list3r.memory.relations.scene import PairMeasures
-from list3r.memory.relations.structure import classify_structure, flagged_only, is_level
-from list3r.memory.world.floor import floor_near
+from list3r.memory.library.world.floor import floor_near
 
 _SLACK_M = 0.05
 _REACH_M = 0.85

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from list3r.memory.description.colors import color_names, color_words, main_color
-from list3r.memory.description.describe import describe
-from list3r.memory.geometry import Array
+from list3r.memory.core.description.colors import color_names, color_words, main_color
+from list3r.memory.core.description.describe import describe
+from list3r.memory.core.geometry import Array
+from list3r.memory.core.records import Instance
 from list3r.memory.library.instances import DerivedInstance
+from list3r.memory.library.relations.instance_geometry import InstanceGeometry
 from list3r.memory.library.rules import World
-from list3r.memory.records import Instance
-from list3r.memory.relations.instance_geometry import InstanceGeometry
 
 
 def record_of(

@@ -6,25 +6,25 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from list3r.memory.change.detection import ChangeSettings
-from list3r.memory.description.colors import Reference
+from list3r.memory.core.description.colors import Reference
+from list3r.memory.core.records import ChunkRow
+from list3r.memory.core.settings import stored_settings
+from list3r.memory.library.change.detection import ChangeSettings
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.instances import DeriveSettings
 from list3r.memory.library.labels import LabelSettings
+from list3r.memory.library.merging.movers import MovingSettings
+from list3r.memory.library.merging.settings import MergeSettings
+from list3r.memory.library.overlap.metre import metre_by_height
+from list3r.memory.library.overlap.planes import place_planes
+from list3r.memory.library.overlap.summaries import Summaries, cameras_of, is_known, light_of, sample_of, world_unit
+from list3r.memory.library.overlap.voxels import ShapeSettings
+from list3r.memory.library.relations.settings import RelationSettings
+from list3r.memory.library.relations.structure import StructureSettings
 from list3r.memory.library.scores import RoundingSettings
-from list3r.memory.merging.movers import MovingSettings
-from list3r.memory.merging.settings import MergeSettings
-from list3r.memory.overlap.metre import metre_by_height
-from list3r.memory.overlap.planes import place_planes
-from list3r.memory.overlap.summaries import Summaries, cameras_of, is_known, light_of, sample_of, world_unit
-from list3r.memory.overlap.voxels import ShapeSettings
-from list3r.memory.records import ChunkRow
-from list3r.memory.relations.settings import RelationSettings
-from list3r.memory.relations.structure import StructureSettings
-from list3r.memory.settings import stored_settings
+from list3r.memory.library.world.gravity import GravitySettings, floor_height, sure_of_up
 from list3r.memory.store.facts import Fact
 from list3r.memory.store.store import Store
-from list3r.memory.world.gravity import GravitySettings, floor_height, sure_of_up
 
 _POSED = 80
 """Posed frames from which it does not matter any more how many there are, see `EvidenceSettings.min_share`."""

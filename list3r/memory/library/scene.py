@@ -7,14 +7,14 @@ from functools import cached_property
 
 import numpy as np
 
-from list3r.memory.geometry import Array, Sim3
+from list3r.memory.core.geometry import Array, Sim3
+from list3r.memory.core.records import ChunkRow, MotionTrack
+from list3r.memory.library.merging.movers import PlacedChunks, Tracks
+from list3r.memory.library.overlap.pair_scores import Key, PairScores
+from list3r.memory.library.overlap.summaries import Summaries, cameras_of
+from list3r.memory.library.overlap.voxels import ChunkShapes, Ints
 from list3r.memory.library.rules import ConsolidationSettings, World
 from list3r.memory.library.scores import Pair, PairScoreCache
-from list3r.memory.merging.movers import PlacedChunks, Tracks
-from list3r.memory.overlap.pair_scores import Key, PairScores
-from list3r.memory.overlap.summaries import Summaries, cameras_of
-from list3r.memory.overlap.voxels import ChunkShapes, Ints
-from list3r.memory.records import ChunkRow, MotionTrack
 from list3r.memory.store.store import Store
 
 _FAR_M = 0.5

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.change.detection import ChangeSettings, across_sessions
-from list3r.memory.change.free_space_carving import FreeSpaceCarving
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3, rotation_exp, rotation_log, stack, take
-from list3r.memory.merging.movers import without_moving
-from list3r.memory.overlap.pair_scores import PairScores, pair_scores
-from list3r.memory.overlap.summaries import Summaries
-from list3r.memory.overlap.voxels import GrownCells
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import Sim3, rotation_exp, rotation_log, stack, take
+from list3r.memory.library.change.detection import ChangeSettings, across_sessions
+from list3r.memory.library.change.free_space_carving import FreeSpaceCarving
+from list3r.memory.library.merging.movers import without_moving
+from list3r.memory.library.overlap.pair_scores import PairScores, pair_scores
+from list3r.memory.library.overlap.summaries import Summaries
+from list3r.memory.library.overlap.voxels import GrownCells
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.pair_scores import StoredScores
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from list3r.memory.change.detection import OverlapGroups, find_changes
-from list3r.memory.change.records import Change
+from list3r.memory.core.records import MergeDecision
+from list3r.memory.library.change.detection import OverlapGroups, find_changes
+from list3r.memory.library.change.records import Change
 from list3r.memory.library.grouping import Group
+from list3r.memory.library.overlap.pair_scores import Key
+from list3r.memory.library.overlap.summaries import SomeSummaries
 from list3r.memory.library.scene import Scene
-from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.overlap.summaries import SomeSummaries
-from list3r.memory.records import MergeDecision
 
 
 @dataclass(frozen=True)

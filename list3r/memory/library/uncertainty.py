@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Array, Sim3, skew
-from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.overlap.voxels import ChunkShapes
-from list3r.memory.records import ChunkRow
+from list3r.memory.core.geometry import Array, Sim3, skew
+from list3r.memory.core.records import ChunkRow
+from list3r.memory.library.overlap.pair_scores import Key
+from list3r.memory.library.overlap.voxels import ChunkShapes
 
 
 @dataclass(frozen=True)

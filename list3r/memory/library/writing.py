@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from list3r.memory.change.detection import as_events
+from list3r.memory.core.records import MergeDecision, Observation
+from list3r.memory.library.change.detection import as_events
 from list3r.memory.library.derivation import Known, Library
 from list3r.memory.library.identities import Identities
+from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.scene import Scene
-from list3r.memory.overlap.pair_scores import Key
-from list3r.memory.records import MergeDecision, Observation
 from list3r.memory.store.store import Store
 
 

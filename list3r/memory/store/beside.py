@@ -10,7 +10,7 @@ from pathlib import Path
 
 import apsw
 
-from list3r.memory.errors import MemoryFileError, MemoryFileWarning
+from list3r.memory.core.errors import MemoryFileError, MemoryFileWarning
 from list3r.memory.store.database import Database
 from list3r.memory.store.file import connected, identified, private_copy, reader, rename_exclusively
 from list3r.memory.store.log_mark import Log, Mark, mark_of_file

@@ -15,7 +15,7 @@ from typing import Any, Self, cast
 
 import apsw
 
-from list3r.memory.errors import MemoryFileError, OptionError
+from list3r.memory.core.errors import MemoryFileError, OptionError
 from list3r.memory.store.beside import not_alone, opened_to_read, take_up_log
 from list3r.memory.store.database import FAILURES, Database
 from list3r.memory.store.file import (

@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Generic, Self, TypeVar, overload
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import UpEstimate
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import UpEstimate
+from list3r.memory.core.unpacking import parse_json
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.rows.json_values import plain, typed
-from list3r.memory.unpacking import parse_json
 
 T = TypeVar("T")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import apsw
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.store.database import Database
 from list3r.memory.store.log_mark import LOG_STARTS, begin_marking
 from list3r.memory.store.pages import PageDamaged, schema_of

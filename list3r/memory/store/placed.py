@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameRow, Instance, Observation, Support
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameRow, Instance, Observation, Support
 from list3r.memory.store.tables.chunks import Chunks
 from list3r.memory.store.tables.edges import Bends
 from list3r.memory.store.tables.events import Events

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from list3r.memory.errors import List3rError, MemoryFileError
+from list3r.memory.core.errors import List3rError, MemoryFileError
 from list3r.memory.store.connection import Connection, is_ours
 from list3r.memory.store.derived import Derived
 from list3r.memory.store.facts import Facts

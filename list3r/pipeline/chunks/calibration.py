@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from list3r.frames.base import Camera, FrameSource, SourceInfo
 from list3r.frames.options import SourceOptions
-from list3r.memory.records import SessionCamera
+from list3r.memory.core.records import SessionCamera
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import get_ready, open_once
 from list3r.pipeline.settings import BuildSettings

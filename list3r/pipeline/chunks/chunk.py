@@ -25,8 +25,8 @@ from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
 from list3r.instances.overlays import draw_debug
 from list3r.instances.registry import make_discoverer, make_frame_descriptor, make_tracker
-from list3r.memory.errors import BaselineError, SourceError, TrackingError
-from list3r.memory.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
+from list3r.memory.core.errors import BaselineError, SourceError, TrackingError
+from list3r.memory.core.records import ChunkResult, FrameSamples, Keyframe, LocalLibrary
 from list3r.models.cache import locate
 from list3r.models.device import out_of_memory_reported
 from list3r.pipeline.settings import BuildSettings

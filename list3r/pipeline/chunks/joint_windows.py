@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from list3r.association.revisits.joint_source import JointSourceReconstructor
 from list3r.association.revisits.joint_window import JointReconstructor
-from list3r.memory.records import ChunkResult, JointWindow
+from list3r.memory.core.records import ChunkResult, JointWindow
 from list3r.memory.store.store import Store
 from list3r.models.cards import find_card
 from list3r.pipeline.chunks.chunk import ChunkTask, joint_model

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from list3r.frames.base import FrameSource, index_at
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, even_chunks
-from list3r.memory.records import ChunkRow
+from list3r.memory.core.records import ChunkRow
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from list3r.memory.errors import MissingPackageError, OptionError, install_hint
+from list3r.memory.core.errors import MissingPackageError, OptionError, install_hint
 
 
 class RayCluster:

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
-from list3r.memory.errors import List3rError, OptionError
+from list3r.memory.core.errors import List3rError, OptionError
 from list3r.pipeline.workers.cluster import RayCluster
 from list3r.pipeline.workers.pool import in_order
 from list3r.pipeline.workers.process import one_thread

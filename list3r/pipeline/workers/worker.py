@@ -13,7 +13,7 @@ from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import Any
 
-from list3r.memory.errors import List3rError
+from list3r.memory.core.errors import List3rError
 
 
 class WorkerError(List3rError):

@@ -16,9 +16,9 @@ from __future__ import annotations
 import string
 from dataclasses import dataclass, replace
 
-from list3r.memory.description.nouns import is_a
-from list3r.memory.description.spelling import adjectives, split_words
-from list3r.memory.errors import OptionError
+from list3r.memory.core.description.nouns import is_a
+from list3r.memory.core.description.spelling import adjectives, split_words
+from list3r.memory.core.errors import OptionError
 from list3r.queries.finding.tokens import (
     ENDS,
     LONGEST,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from list3r.memory.description.nouns import all_nouns, kinds_of, narrower, nouns_of
-from list3r.memory.description.spelling import split_words
-from list3r.memory.description.words import kind_word
-from list3r.memory.records import Instance
+from list3r.memory.core.description.nouns import all_nouns, kinds_of, narrower, nouns_of
+from list3r.memory.core.description.spelling import split_words
+from list3r.memory.core.description.words import kind_word
+from list3r.memory.core.records import Instance
 from list3r.queries.finding.grammar import Phrase
 
 SYNONYM, NARROWER, USEFUL = 0.95, 0.9, 0.85

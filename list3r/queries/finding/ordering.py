@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from list3r.memory.records import Instance
+from list3r.memory.core.records import Instance
 from list3r.queries.finding.grammar import Order, Phrase
 from list3r.queries.finding.related import PhraseMatch, PhraseSearch, viewer_of
 from list3r.queries.finding.tokens import SIZES

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from list3r.memory.description.printable import shown_between
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.core.description.printable import shown_between
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.finding.free_words import WordEncoder
 from list3r.queries.finding.grammar import Clause

@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from list3r.memory.description.nouns import all_nouns, names, unaccented
-from list3r.memory.description.spelling import split_words
+from list3r.memory.core.description.nouns import all_nouns, names, unaccented
+from list3r.memory.core.description.spelling import split_words
 
 LONGEST = 7
 """Words of the longest phrase."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from list3r.memory.description.nouns import nouns_of
-from list3r.memory.description.spelling import split_words
-from list3r.memory.description.words import kind_word, vocabulary
-from list3r.memory.errors import OptionError
-from list3r.memory.records import Instance
+from list3r.memory.core.description.nouns import nouns_of
+from list3r.memory.core.description.spelling import split_words
+from list3r.memory.core.description.words import kind_word, vocabulary
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Instance
 
 _IGNORED = frozenset("a an the of in on at with and or some any my thing things object objects".split())
 STRUCTURE = frozenset(("floor", "ceiling", "wall"))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.records import Instance
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.match import Filters
 from list3r.queries.views.surfaces import STRAY, surfaces_of

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import OptionError
-from list3r.memory.geometry import Sim3, rotation_from_quat_wxyz
-from list3r.memory.records import ChunkRow, FrameRow
+from list3r.memory.core.errors import OptionError
+from list3r.memory.core.geometry import Sim3, rotation_from_quat_wxyz
+from list3r.memory.core.records import ChunkRow, FrameRow
 from list3r.memory.store.store import Store
 from list3r.queries.match import checked_point
 

@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.words import kind_word
-from list3r.memory.errors import UnknownIdError
-from list3r.memory.records import Instance
-from list3r.memory.relations.predicates import PREDICATES
+from list3r.memory.core.description.words import kind_word
+from list3r.memory.core.errors import UnknownIdError
+from list3r.memory.core.records import Instance
+from list3r.memory.library.relations.predicates import PREDICATES
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.words import Bearers
 from list3r.queries.finding.grammar import Clause, Phrase

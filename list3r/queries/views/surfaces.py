@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.records import Instance
+from list3r.memory.core.records import Instance
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from list3r.memory.geometry import Array
-from list3r.memory.records import Instance, Relation
-from list3r.memory.relations.scene import certainty
+from list3r.memory.core.geometry import Array
+from list3r.memory.core.records import Instance, Relation
+from list3r.memory.library.relations.scene import certainty
 
 VIEWPOINT = ("left_of", "right_of", "in_front_of", "behind")
 """Predicates that hold from a viewpoint only."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.records import Instance
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.queries.views.camera import PosedCamera
 from list3r.queries.views.surfaces import inside_box

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.features.learned import LEARNED_WIDTH, LearnedFeatures
 
 DIVISOR = 32

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.features.learned import LearnedDetector
 
 KINDS = ("aliked",)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.errors import DegenerateError, TrackingError
+from list3r.memory.core.errors import DegenerateError, TrackingError
 from list3r.models.cache import locate, resolve
 from list3r.models.cards import ModelCard, find_card
 from list3r.models.device import MemoryBudget, find_gpu, is_out_of_memory

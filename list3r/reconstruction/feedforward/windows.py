@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
-from list3r.memory.errors import DegenerateError, OptionError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import DegenerateError, OptionError
+from list3r.memory.core.geometry import Sim3
 from list3r.models.device import MemoryBudget, is_out_of_memory
 from list3r.reconstruction.feedforward.output import WindowOutput
 

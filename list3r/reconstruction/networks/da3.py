@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.models.images import normalised
 from list3r.reconstruction.feedforward.network import (
     FeedforwardReconstructor,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.feedforward.network import FeedforwardReconstructor, Network
 from list3r.reconstruction.feedforward.pictures import CutSize
 from list3r.reconstruction.networks import cut3r

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.reconstruction.feedforward.pictures import Loader, Placement
 from list3r.reconstruction.precomputed_files import Manifest, Piece
 

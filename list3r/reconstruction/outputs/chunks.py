@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import read_file
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.reconstruction.feedforward.network import sigmoid_of_expp1
 from list3r.reconstruction.feedforward.pictures import Placement, WidthSize
 from list3r.reconstruction.feedforward.points import from_points, in_camera

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.reconstruction.feedforward.network import sigmoid_of_expp1
 from list3r.reconstruction.feedforward.pictures import CutSize
 from list3r.reconstruction.outputs.base import OutputOptions, ProgramOutput, Views

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.decoding.decode import read_color
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.reconstruction.precomputed_files import Piece
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.files import read_file
-from list3r.memory.errors import OptionError
+from list3r.memory.core.errors import OptionError
 
 _MAGIC = 20000630
 _LINES = {0: 1, 2: 1, 3: 16}

@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from list3r.memory.errors import ExportError, SourceError
+from list3r.memory.core.errors import ExportError, SourceError
 from list3r.reconstruction.outputs.arrays import ArraysReader
 from list3r.reconstruction.outputs.base import OutputOptions, OutputReader
 from list3r.reconstruction.outputs.chunks import ChunksReader

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from list3r.frames.files import read_file
-from list3r.memory.errors import SourceError
+from list3r.memory.core.errors import SourceError
 from list3r.reconstruction.feedforward.pictures import WidthSize
 from list3r.reconstruction.outputs.base import Array, OutputOptions, ProgramOutput, Views, from_corner
 from list3r.reconstruction.outputs.exr import read_exr

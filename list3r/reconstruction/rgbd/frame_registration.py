@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import skew
+from list3r.memory.core.geometry import skew
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.poses import small_motion
 from list3r.reconstruction.rgbd.kernels import (

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.memory.errors import OptionError, TrackingError
+from list3r.memory.core.errors import OptionError, TrackingError
 from list3r.reconstruction.base import PosedOnly, Reconstruction
 from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
 from list3r.reconstruction.motion.tracks import track_movers

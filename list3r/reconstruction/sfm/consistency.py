@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.memory.geometry import skew
+from list3r.memory.core.geometry import skew
 from list3r.reconstruction.sfm.settings import ConsistencySettings
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.frames.decoding.picture import gray_of
-from list3r.memory.errors import BaselineError, OptionError, TrackingError
+from list3r.memory.core.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
 from list3r.reconstruction.features.detectors import make_detector

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import OrientedBox
+from list3r.memory.core.geometry import OrientedBox
 from list3r.simulation.worlds.materials import Material
 
 BOX, CYLINDER, SPHERE = 0, 1, 2

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import OrientedBox, quat_wxyz_from_rotation
+from list3r.memory.core.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.simulation.worlds.gaps import surface_gap
 from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.world import SimulatedWorld

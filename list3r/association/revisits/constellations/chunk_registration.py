@@ -31,7 +31,7 @@ from list3r.association.revisits.constellations.surface_fit import (
     fit_surfaces,
 )
 from list3r.association.revisits.cross_check import CrossSettings, Side, cross_check
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.cross_check import Side
-from list3r.memory.geometry import upright_box
-from list3r.memory.records import FrameSamples
+from list3r.memory.core.geometry import upright_box
+from list3r.memory.core.records import FrameSamples
 from list3r.memory.store.tables.local_instances import LocalNode
 
 Array = NDArray[np.float64]

@@ -32,8 +32,8 @@ from list3r.association.revisits.constellations.matching import match_constellat
 from list3r.association.revisits.constellations.neighbourhood import Neighbour, NeighbourhoodSettings, gather
 from list3r.association.revisits.constellations.surface_fit import ChunkSurfaces
 from list3r.association.revisits.cross_check import Side
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkRow, Edge
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkRow, Edge
 from list3r.memory.store.store import Store
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.revisits.constellations.constellation import Constellation
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

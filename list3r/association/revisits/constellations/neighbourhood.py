@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from list3r.association.revisits.cross_check import Side
 from list3r.association.revisits.instance_similarity import SimilaritySettings, instance_set
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import FrameSamples, Support
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import FrameSamples, Support
 from list3r.memory.store.tables.local_instances import LocalNode
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from list3r.association.revisits.cross_check import Side
-from list3r.memory.geometry import Sim3, skew
+from list3r.memory.core.geometry import Sim3, skew
 
 Array = NDArray[np.float64]
 

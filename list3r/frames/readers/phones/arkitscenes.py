@@ -16,7 +16,7 @@ from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, read_
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.readers.tum import poses_at
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 LEAST_CONFIDENCE = 1
 """Depth of confidence 0 is unknown (stored 0, 1, 2)."""

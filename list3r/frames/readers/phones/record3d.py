@@ -27,8 +27,8 @@ from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
 from list3r.frames.recordings.stored import CodedArray, Stored, ZipMember
-from list3r.memory.errors import OptionError, SourceError
-from list3r.memory.unpacking import open_archive, parse_json
+from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.unpacking import open_archive, parse_json
 
 LEAST_CONFIDENCE = 2
 """Only what the sensor is most sure of (stored 0, 1, 2); lesser depth lies along edges."""

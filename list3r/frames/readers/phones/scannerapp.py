@@ -17,7 +17,7 @@ from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 _PICTURE = re.compile(r"frame_(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
 _LEAST_CONFIDENCE = 1

@@ -20,7 +20,7 @@ from list3r.frames.layout import VARIES, pose_matrix, read_json, varies_note
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.readers.video_depth import RecordingParts, VideoWithDepth
 from list3r.frames.recordings.stored import CodedArray, FileSlice
-from list3r.memory.errors import FrameError, OptionError, SourceError
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
 
 _SIZE = (192, 256)
 _TABLE, _DEPTH = "pose_intrinsic_imu.json", "depth.bin"

@@ -15,7 +15,7 @@ from list3r.frames.layout import read_lines, read_numbers
 from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
 from list3r.frames.readers.video_depth import RecordingParts, VideoWithDepth
 from list3r.frames.recordings.axes import Z_UP_FROM_Y_UP, pose_of_quaternion
-from list3r.memory.errors import OptionError, SourceError
+from list3r.memory.core.errors import OptionError, SourceError
 
 LEAST_CONFIDENCE = 1
 """Depth of confidence 0 is unknown (stored 0, 1, 2)."""

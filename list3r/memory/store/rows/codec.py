@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.unpacking import open_archive
 from list3r.memory.store.rows.npz import read_members, write_npz
-from list3r.memory.unpacking import open_archive
 
 MAX_BLOB_BYTES = 256 * 2**20
 """No array of one row is larger than this; a blob that claims more is damaged or hostile."""

@@ -1,7 +1,7 @@
 """Columns of a table from the fields of its record: one field is one column of its name and type.
 
 Numbers, texts and blobs are what they are in SQLite; a similarity, a box or an array whose shape is noted
-(`memory.records.Shape`) is a blob of little-endian numbers, a record of arrays a compressed blob, and all else JSON.
+(`core.records.Shape`) is a blob of little-endian numbers, a record of arrays a compressed blob, and all else JSON.
 What older schemas cut otherwise is said by a `Column`: several fields in one column, or one field in several.
 """
 
@@ -18,12 +18,12 @@ from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import OrientedBox, Sim3
-from list3r.memory.records import Shape
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import OrientedBox, Sim3
+from list3r.memory.core.records import Shape
+from list3r.memory.core.unpacking import parse_json
 from list3r.memory.store.rows.codec import pack, pack_sim3, raw_array, to_json, unpack, unpack_sim3
 from list3r.memory.store.rows.json_values import array_scalar, plain, typed
-from list3r.memory.unpacking import parse_json
 
 R = TypeVar("R")
 Value = str | int | float | bytes | None

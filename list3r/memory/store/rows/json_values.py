@@ -11,7 +11,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.geometry import Sim3
+from list3r.memory.core.geometry import Sim3
 
 
 def array_scalar(hint: Any) -> Any:

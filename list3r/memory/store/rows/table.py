@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.store.connection import Arguments, Connection
 from list3r.memory.store.rows.codec import checksum
 from list3r.memory.store.rows.columns import UNREADABLE, Columns, Value

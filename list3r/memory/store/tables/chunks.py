@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.geometry import Sim3
-from list3r.memory.records import ChunkResult, ChunkRow, Covariance, FrameSamples, Shape
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.records import ChunkResult, ChunkRow, Covariance, FrameSamples, Shape
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns, arrays, joined
 from list3r.memory.store.rows.table import Table

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.bends import Bend
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.records import Edge
+from list3r.memory.core.bends import Bend
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import Edge
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns, joined
 from list3r.memory.store.rows.table import Table

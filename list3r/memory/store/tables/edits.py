@@ -6,14 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from list3r.memory.constraints import Constraints, Edit, Key
-from list3r.memory.records import MergeDecision
+from list3r.memory.core.constraints import Constraints, Edit, Key
+from list3r.memory.core.records import MergeDecision
+from list3r.memory.core.unpacking import parse_json
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import to_json
 from list3r.memory.store.rows.columns import Columns, joined, nested
 from list3r.memory.store.rows.json_values import plain
 from list3r.memory.store.rows.table import Table
-from list3r.memory.unpacking import parse_json
 
 EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "undo")
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.table import batches
 

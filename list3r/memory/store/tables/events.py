@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import ChangeEvent
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import ChangeEvent
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import raw_array
 from list3r.memory.store.rows.columns import Column, Columns, joined

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.records import ChunkResult, ChunkRow, FrameRow, Keyframe
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import ChunkResult, ChunkRow, FrameRow, Keyframe
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import pack, unpack
 from list3r.memory.store.rows.columns import Columns, joined, nested

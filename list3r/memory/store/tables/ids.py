@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from list3r.memory.constraints import standing
-from list3r.memory.errors import UnknownIdError
-from list3r.memory.records import FIRST_SCRAP
+from list3r.memory.core.constraints import standing
+from list3r.memory.core.errors import UnknownIdError
+from list3r.memory.core.records import FIRST_SCRAP
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.facts import Facts
 from list3r.memory.store.rows.columns import Columns

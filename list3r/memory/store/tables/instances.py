@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.geometry import OrientedBox
-from list3r.memory.records import BestView, Instance
+from list3r.memory.core.geometry import OrientedBox
+from list3r.memory.core.records import BestView, Instance
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import raw_array
 from list3r.memory.store.rows.columns import Columns, joined

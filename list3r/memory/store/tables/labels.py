@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from list3r.memory.records import DetectedLabel, Votes
+from list3r.memory.core.records import DetectedLabel, Votes
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns, nested
 from list3r.memory.store.rows.table import Table

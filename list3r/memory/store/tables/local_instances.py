@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.errors import MemoryFileError
-from list3r.memory.records import Feature, LocalInstance, MaskTrack, MotionTrack, Plane, Support
+from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import Feature, LocalInstance, MaskTrack, MotionTrack, Plane, Support
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import dequantise, pack, quantise, raw_array, unpack
 from list3r.memory.store.rows.columns import Columns, joined, nested

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from list3r.memory.records import Observation
+from list3r.memory.core.records import Observation
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns
 from list3r.memory.store.rows.table import Table, batches

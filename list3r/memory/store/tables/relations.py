@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.records import Relation
+from list3r.memory.core.records import Relation
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.derived import CurrentCache
 from list3r.memory.store.rows.columns import Columns

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from list3r.memory.errors import MemoryFileError, OptionError
-from list3r.memory.records import Session
+from list3r.memory.core.errors import MemoryFileError, OptionError
+from list3r.memory.core.records import Session
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.columns import Columns
 from list3r.memory.store.rows.table import Table

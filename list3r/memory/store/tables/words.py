@@ -8,12 +8,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.description.words import vocabulary
-from list3r.memory.records import Instance
+from list3r.memory.core.description.words import vocabulary
+from list3r.memory.core.records import Instance
 from list3r.memory.store.connection import Connection
 
 _WEIGHTS = (100, 98, 90, 80)
-"""How well a word names an instance, in hundredths, see `memory.description.words`; each is a column."""
+"""How well a word names an instance, in hundredths, see `memory.core.description.words`; each is a column."""
 _MOST_WORDS = 6
 """Of a phrase that are told apart by their weights; the others must be there."""
 Bearers = tuple[NDArray[np.int64], NDArray[np.int16]]

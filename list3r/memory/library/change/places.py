@@ -1,0 +1,459 @@
+"""The places of instances, session by session: what was seen there, what it looked like, what frames tell about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from list3r.memory.core.geometry import Array, OrientedBox
+from list3r.memory.core.records import ChunkRow
+from list3r.memory.library.change.records import ChangeSettings
+from list3r.memory.library.change.surface_colors import (
+    HALF_LIGHT,
+    SAME_LIGHT,
+    Colors,
+    LightBetween,
+    color_distance,
+    lab,
+    meeting,
+    small_picture,
+)
+from list3r.memory.library.merging.edges import Key
+from list3r.memory.library.overlap.summaries import ChunkSummary, world_unit
+from list3r.memory.library.overlap.visibility import (
+    DepthView,
+    Ints,
+    OtherSurface,
+    PlaceVisibility,
+    changed_points,
+    in_sight_of,
+    place_visibility,
+    seen_through_share,
+    tally,
+    views_of,
+)
+from list3r.memory.library.overlap.voxels import ChunkShapes
+from list3r.memory.library.relations.instance_geometry import fit_box
+from list3r.memory.library.world.session_ties import SessionTies
+from list3r.memory.store.store import Store
+
+_PICTURES = 256
+"""Small pictures of keyframes that are kept at a time: what is asked about next stands near by."""
+_SPREAD = 0.02
+"""Share of points outside the box at either end by which instances are compared."""
+
+
+@dataclass(frozen=True)
+class GroupLooks:
+    """What a group looks like, over the members of some sessions."""
+
+    extent: Array
+    """Larger and smaller side of the footprint, height; world units, upright where gravity is known. Shape (3,)."""
+    palette: Array
+    """Colours of its surface, CIE L*a*b*, lightness at half weight, in the light of the later session. Shape (N, 3)."""
+
+
+class _Shapes(dict[int, ChunkShapes]):
+    """By chunk, read when they are first asked for: most of what sessions before saw is not."""
+
+    def __init__(self, summaries: Mapping[int, ChunkSummary]) -> None:
+        self._summaries = summaries
+
+    def __missing__(self, chunk_id: int) -> ChunkShapes:
+        return self.setdefault(chunk_id, self._summaries[chunk_id].shapes)
+
+
+class Places:
+    """The groups of local instances as places of instances, numbered."""
+
+    def __init__(
+        self,
+        store: Store,
+        groups: Sequence[Sequence[Key]],
+        chunks: Sequence[ChunkRow],
+        summaries: Mapping[int, ChunkSummary],
+        settings: ChangeSettings,
+    ) -> None:
+        self.groups = groups
+        self.rows = {c.chunk_id: c for c in chunks}
+        self.shapes = _Shapes(summaries)
+        self.unit = world_unit(chunks, summaries)
+        self.ties = SessionTies(store.edges.all(), self.rows)
+        self._upright = store.facts.gravity != "unknown"
+        self._first = min(c.component for c in chunks)
+        self._store, self._s = store, settings
+        self._views: dict[tuple[int, int], list[DepthView]] = {}
+        self._light: dict[int, LightBetween] = {}
+        self._share: dict[tuple[Key, int, bool], float] = {}
+        self._extents: dict[int, Array] = {}
+        self._sights: dict[tuple[int, int], Array] = {}
+        self._stayed: dict[tuple[int, int], OrientedBox] = {}
+        self._frames: dict[tuple[int, int], int] = {}
+        self._summaries: dict[int, tuple[float, Array]] = {}
+        self._structure = store.local_instances.structure(sorted(self.rows))
+        self._picture = lru_cache(_PICTURES)(self._read_picture)
+        self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
+        self.component = [self.rows[g[0][0]].component for g in groups]
+
+    def members(self, n: int, session: int, *, before: bool, stayed: bool = False) -> list[Key]:
+        """Return members of the last session before, or of this one; those that tell of the change, if it has not
+        `stayed`.
+        """
+        wanted = self._told_by(n, session, before=before)
+        inside = [k for k in self.groups[n] if self.rows[k[0]].session_id == wanted]
+        return inside if stayed else self._pure(n, inside, session, before=before)
+
+    def _told_by(self, n: int, session: int, *, before: bool) -> int:
+        """Return the last session before that saw an instance, or this one."""
+        return max((s for s in self.sessions[n] if s < session), default=session) if before else session
+
+    def _pure(self, n: int, members: list[Key], session: int, *, before: bool) -> list[Key]:
+        """Return those that hold least of what stayed, where what they show has changed: not what is mixed with a
+        table.
+        """
+        if len(members) < 2:
+            return members
+        shares = np.array([self._shares(key, n, session, before=before) for key in members])
+        common = float(np.average(shares, weights=[len(self._points_of(key)) + 1 for key in members]))
+        if common < self._s.seen_through / 2:
+            return members
+        return [k for k, share in zip(members, shares.tolist(), strict=True) if share >= self._s.pure * common]
+
+    def _shares(self, key: Key, n: int, session: int, *, before: bool) -> float:
+        """Return the share of the surface of one member that is seen through."""
+        name = (key, session, before)
+        if name not in self._share:
+            self._share[name] = self._changed(self._points_of(key), n, session, before=before)
+        return self._share[name]
+
+    def points(self, n: int, session: int, *, before: bool, stayed: bool = False) -> Array:
+        """Return some surface points, world coordinates. Shape (N, 3)."""
+        return self._thinned(n, session, before=before, stayed=stayed)[0]
+
+    def _thinned(self, n: int, session: int, *, before: bool, stayed: bool = False) -> tuple[Array, Colors]:
+        """Return the same and their colours. Shape (N, 3) each."""
+        keys = self.members(n, session, before=before, stayed=stayed)
+        points = np.concatenate([self._points_of(key) for key in keys]) if keys else np.zeros((0, 3))
+        rgb = np.concatenate([self._colors_of(key) for key in keys]) if keys else np.zeros((0, 3), np.uint8)
+        step = max(1, len(points) // self._s.points)
+        return points[::step], rgb[::step]
+
+    def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
+        """Return the box of what was seen of it; unless it has stayed, of what of that has changed."""
+        if stayed:
+            name = n, self._told_by(n, session, before=before)
+            if name not in self._stayed:
+                self._stayed[name] = self._box_of(n, self.points(n, session, before=before, stayed=True))
+            return self._stayed[name]
+        points = self.points(n, session, before=before)
+        views = self._views_across(n, session, before=before)
+        return self._box_of(n, self._with_foot(points, self._changed_rows(points, views)))
+
+    def _box_of(self, n: int, points: Array) -> OrientedBox:
+        upright = self._upright and self.component[n] == self._first
+        return fit_box(points if len(points) else np.zeros((1, 3)), upright=upright)
+
+    def out_of_sight(self, n: int, session: int) -> bool:
+        """Return whether no frame of a session can tell about any surface of an instance."""
+        name = session, self.component[n]
+        if name not in self._sights:
+            self._sights[name] = in_sight_of(self._views_of(*name), self._s.visibility)
+        low, high = self.extent(n)
+        sights = self._sights[name]
+        return not bool(np.all((sights[:, 0] <= high) & (sights[:, 1] >= low), axis=1).any())
+
+    def far_apart(self, n: int, m: int) -> bool:
+        """Return whether two instances lie so far apart that no surface of `n` meets `m`, or lies in the box of `m`.
+
+        The box of some points reaches beyond them by less than twice the diagonal of their extent.
+        """
+        a, b = self.extent(n), self.extent(m)
+        meets = max(self._s.meets_m, self._s.replaced_link_m) * self.unit
+        reach = 2.0 * np.linalg.norm(b[1] - b[0]) + meets
+        return bool(np.any((a[0] > b[1] + reach) | (a[1] < b[0] - reach)))
+
+    def extent(self, n: int) -> Array:
+        """Return the box round all that was ever seen of an instance, world coordinates; NaN where there is nothing.
+        Shape (2, 3).
+        """
+        if n not in self._extents:
+            points = np.concatenate([self._points_of(key) for key in self.groups[n]])
+            found = [points.min(axis=0), points.max(axis=0)] if len(points) else np.full((2, 3), np.nan)
+            self._extents[n] = np.array(found)
+        return self._extents[n]
+
+    def inside(self, n: int, box: OrientedBox, slack_m: float, session: int, *, before: bool) -> float:
+        """Return the share of its surface points that lie in a box."""
+        points = self.points(n, session, before=before)
+        if len(points) == 0:
+            return 0.0
+        off = np.abs((points - box.center) @ box.rotation)
+        return float(np.mean(np.all(off <= box.size / 2 + slack_m * self.unit, axis=1)))
+
+    def look_after(self, n: int, session: int) -> PlaceVisibility:
+        """Return what a session's frames see where an instance was before."""
+        return self._look(n, self._views_of(session, self.component[n]), session, before=True)
+
+    def look_before(self, n: int, session: int) -> PlaceVisibility:
+        """Return what the frames of the last session that could tell saw where an instance is now.
+
+        A session of which too few frames tell is passed over where one before it can.
+        """
+        doubtful = PlaceVisibility("unseen", 0.0, ())
+        for views in self._views_before(n, session):
+            found = self._look(n, views, session, before=False)
+            if found.verdict == "unclear" and len(found.frames) < self._s.visibility.least_frames:
+                doubtful = found if doubtful.verdict == "unseen" else doubtful
+            elif found.verdict != "unseen":
+                return found
+        return doubtful
+
+    def _look(self, n: int, views: Sequence[DepthView], session: int, *, before: bool) -> PlaceVisibility:
+        """Return what frames see at a place, by depth and, where that sees a surface, by its colours; nothing is told
+        of what may be there as the session may lie.
+        """
+        (points, rgb), s = self._thinned(n, session, before=before), self._s
+        found, other = place_visibility(points, views, s.visibility), None
+        if found.verdict in ("there", "unclear"):
+            other = self._other_colors(rgb, session, before=before)
+            by_color = found if other is None else place_visibility(points, views, s.visibility, other)
+            found = by_color if by_color.verdict == "gone" else found
+        if found.verdict == "gone":
+            known = s.visibility.tolerance_m * self.unit
+            for shift in self.ties.shifts(session, points.mean(axis=0), s.placed_deviations, known):
+                if place_visibility(points + shift, views, s.visibility, other).verdict != "gone":
+                    return PlaceVisibility("unseen", 0.0, ())
+        return found
+
+    def _other_colors(self, rgb: Colors, session: int, *, before: bool) -> OtherSurface | None:
+        """Return what tells whether frames show other colours than points have; None where the light is not known.
+
+        The points were seen `before` the session and the frames are of it, or the other way round. Shape (N, 3).
+        """
+        light = self.light(session)
+        if light is SAME_LIGHT:
+            return None
+        own, limit = light.lab(rgb) if before else lab(rgb), light.limit(self._s)
+
+        def other(view: DepthView, points: Array, rows: Ints) -> NDArray[np.bool_]:
+            picture = self._picture(view.chunk_id, view.frame_index, *view.depth.shape)
+            if picture is None:
+                return np.zeros(len(rows), bool)
+            u, v = view.pixels(points)
+            shown = lab(picture[v, u]) if before else light.lab(picture[v, u])
+            return color_distance(own[rows], shown) > limit
+
+        return other
+
+    def _read_picture(self, chunk_id: int, frame_index: int, height: int, width: int) -> Colors | None:
+        return small_picture(self._store.keyframes.get(chunk_id, frame_index).jpeg, height, width)
+
+    def changed(self, n: int, session: int, *, before: bool) -> float:
+        """Return the share of its surface that is seen through, of what is told: of what was, by a session that comes
+        after; of what is, by the sessions before.
+        """
+        return self._changed(self.points(n, session, before=before), n, session, before=before)
+
+    def explained(self, n: int, new: Sequence[int], session: int) -> float:
+        """Return the share of the surface that an instance had which is seen through or lies at what is new there, of
+        what is told.
+        """
+        from scipy.spatial import cKDTree
+
+        points = self.points(n, session, before=True)
+        free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
+        known = free + met > 0
+        if not known.any():
+            return 0.0
+        surfaces = [self.points(m, session, before=False) for m in new]
+        near = np.zeros(len(points), bool)
+        if any(len(x) for x in surfaces):
+            reach = self._s.replaced_link_m * self.unit
+            tree = cKDTree(np.concatenate(surfaces))
+            near = np.asarray(tree.query(points, distance_upper_bound=reach)[0] < np.inf)
+        return float(np.mean((near | (free > met))[known]))
+
+    def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
+        lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)
+        shares = (seen_through_share(points, views, self._s.visibility) for views in lists)
+        return next((share for share in shares if share is not None), 0.0)
+
+    def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
+        """Return the views of the sessions before that can tell about an instance, the last session first."""
+        component = self.component[n]
+        earlier = {c.session_id for c in self.rows.values() if c.component == component and c.session_id < session}
+        told_by = (s for s in sorted(earlier, reverse=True) if not self.out_of_sight(n, s))
+        return (self._views_of(s, component) for s in told_by)
+
+    def known_before(self, n: int, session: int) -> bool:
+        """Return whether an earlier session lies in the same world, so that an instance can be new to it."""
+        return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
+
+    def looks(self, n: int, session: int, *, before: bool, stayed: bool = False) -> GroupLooks:
+        """Return its looks, the views that show most of it first; what is there all along is left out of its size,
+        unless that has other colours now, so that it has not `stayed` where depth says so.
+
+        `before` a session that does not show it there any more, in all earlier ones, else in the first that does.
+        """
+        if before:
+            keys = [k for k in self.groups[n] if self.rows[k[0]].session_id < session]
+            keys = keys if stayed else self._pure(n, keys, session, before=True)
+        else:
+            keys = self.members(n, session, before=False, stayed=stayed)
+        weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
+        views = [] if stayed else self._views_across(n, session, before=before)
+        rgb = [self._colors_of(key)[self._changed_rows(self._points_of(key), views)] for key in keys]
+        light = self.light(session) if before else SAME_LIGHT
+        return GroupLooks(self._extent(keys, weight, views), light.lab(np.concatenate(rgb)))
+
+    def plainly_other(self, n: int, m: int) -> bool:
+        """Return whether two groups cannot be one instance by the size and the colour that chunks say of them."""
+        (size_a, lab_a), (size_b, lab_b) = self._summed_up(n), self._summed_up(m)
+        ratio = max(size_a, size_b) / max(min(size_a, size_b), 1e-9)
+        color = float(np.linalg.norm((lab_a - lab_b) * HALF_LIGHT))
+        return ratio > self._s.other_size or color > self._s.other_color
+
+    def _summed_up(self, n: int) -> tuple[float, Array]:
+        if n not in self._summaries:
+            rows = [(self.shapes[k], self._at(k, i)) for k, i in self.groups[n]]
+            sizes, labs = [shape.size[at] / shape.unit for shape, at in rows], [shape.lab[at] for shape, at in rows]
+            self._summaries[n] = float(np.median(sizes)), np.median(labs, axis=0)
+        return self._summaries[n]
+
+    def light(self, session: int) -> LightBetween:
+        """Return how the colours of the sessions before come out in a session, by what both have seen."""
+        if session not in self._light:
+            before, after = [np.zeros((0, 3), np.uint8)], [np.zeros((0, 3), np.uint8)]
+            for n, sessions in enumerate(self.sessions):
+                if session in sessions and sessions[0] < session:
+                    a, b = self._meeting(n, n, session)
+                    before.append(a)
+                    after.append(b)
+            light = LightBetween.of(np.concatenate(before), np.concatenate(after))
+            self._light[session] = light or SAME_LIGHT
+        return self._light[session]
+
+    def other_surface(self, n: int, m: int, session: int) -> bool:
+        """Return whether a new instance `m` lies where the surface of `n` was, in other colours."""
+        a, b = self._meeting(n, m, session)
+        light = self.light(session)
+        if len(a) < self._s.displaced * sum(len(self._points_of(k)) for k in self._surface(n, session, before=True)):
+            return False
+        return len(a) > 0 and float(np.median(color_distance(light.lab(a), lab(b)))) > light.limit(self._s)
+
+    def _meeting(self, n: int, m: int, session: int) -> tuple[Colors, Colors]:
+        """Return the colours of the points of `n` before a session that meet `m` in it, and of what they meet."""
+        old, new = self._surface(n, session, before=True), self._surface(m, session, before=False)
+        points = [np.concatenate([self._points_of(k) for k in keys]) for keys in (old, new)]
+        rgb = [np.concatenate([self._colors_of(k) for k in keys]) for keys in (old, new)]
+        if not len(points[0]) or not len(points[1]):
+            return rgb[0][:0], rgb[1][:0]
+        near, at = meeting(cKDTree(points[1]), points[0], self._s.meets_m * self.unit)
+        return rgb[0][near], rgb[1][at]
+
+    def _surface(self, n: int, session: int, *, before: bool) -> list[Key]:
+        return self.members(n, session, before=before, stayed=True)
+
+    def _extent(self, keys: Sequence[Key], weight: Array, views: Sequence[DepthView]) -> Array:
+        """Return the weighted median over its whole views, so that what one view took from its surroundings does not
+        count.
+        """
+        whole = [self.shapes[k].truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
+        sizes, weights = [], []
+        for key, is_whole, w in zip(keys, whole, weight, strict=True):
+            points = self._points_of(key)
+            points = self._with_foot(points, self._changed_rows(points, views))
+            if len(points) and (is_whole or not any(whole)):
+                sizes.append(self._sides(fit_box(points, upright=self._upright, trim=_SPREAD)))
+                weights.append(w)
+        if not sizes:
+            return np.ones(3)
+        return np.array([_weighted_median(np.array(sizes)[:, d], np.array(weights)) for d in range(3)])
+
+    def _views_across(self, n: int, session: int, *, before: bool) -> list[DepthView]:
+        """Return the views that tell what of an instance has changed: of this session where it was there before, else
+        before.
+        """
+        return self._views_of(session, self.component[n]) if before else next(self._views_before(n, session), [])
+
+    def _changed_rows(self, points: Array, views: Sequence[DepthView]) -> NDArray[np.bool_]:
+        """Return which points have changed, where that is enough of them; else all. Shape (N,)."""
+        changed = changed_points(points, views, self._s.visibility)
+        return changed if changed.sum() >= self._s.least_changed * len(points) else np.ones(len(points), bool)
+
+    def _with_foot(self, points: Array, changed: NDArray[np.bool_]) -> Array:
+        """Return the points that have changed, and those below that depth does not tell from what they stand on."""
+        if not self._upright or changed.all() or not changed.any():
+            return points[changed]
+        box = fit_box(points[changed], upright=True, trim=_SPREAD)
+        off = np.abs((points - box.center) @ box.rotation)[:, :2]
+        lowest = float(box.center[2] - box.size[2] / 2)
+        foot = (off <= box.size[:2] / 2).all(axis=1) & (points[:, 2] < lowest)
+        foot &= points[:, 2] > lowest - self._s.foot_m * self.unit
+        return points[changed | foot]
+
+    def _sides(self, box: OrientedBox) -> Array:
+        if not self._upright:
+            return np.sort(box.size)[::-1]
+        return np.array([*np.sort(box.size[:2])[::-1], box.size[2]])
+
+    def flagged(self, n: int) -> float:
+        """Return the share of its members that are flagged as structure."""
+        return sum(key in self._structure for key in self.groups[n]) / len(self.groups[n])
+
+    def frames(self, n: int, before: int) -> int:
+        """Return frames of earlier sessions in which an instance was seen."""
+        return sum(self.frames_in(n, s) for s in self.sessions[n] if s < before)
+
+    def frames_in(self, n: int, session: int) -> int:
+        """Return frames of one session's recording in which an instance was seen."""
+        if (n, session) not in self._frames:
+            own = [self.shapes[k].stands_for for k, _ in self.groups[n] if self.rows[k].session_id == session]
+            self._frames[n, session] = max(own, default=1) * len({f for _, f in self._sightings(n, session)})
+        return self._frames[n, session]
+
+    def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
+        """Return the frames of a session that see most of an instance."""
+        best: dict[int, int] = {}
+        for area, frame in self._sightings(n, session):
+            best[frame] = max(area, best.get(frame, 0))
+        return tuple((session, f) for f in sorted(best, key=lambda f: (-best[f], f)))
+
+    def _sightings(self, n: int, session: int) -> list[tuple[int, int]]:
+        out = []
+        for chunk_id, local_id in self.groups[n]:
+            if self.rows[chunk_id].session_id == session:
+                shape, at = self.shapes[chunk_id], self._at(chunk_id, local_id)
+                out += [(int(a), int(f)) for a, f in zip(shape.areas_px[at], shape.frames[at], strict=True)]
+        return out
+
+    def _views_of(self, session: int, component: int) -> list[DepthView]:
+        if (session, component) not in self._views:
+            rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
+            keyframes = {c.chunk_id: self._store.keyframes.of(c.chunk_id) for c in rows}
+            self._views[session, component] = views_of(rows, keyframes, self.unit)
+        return self._views[session, component]
+
+    def _points_of(self, key: Key) -> Array:
+        shape, at = self.shapes[key[0]], self._at(*key)
+        start, stop = np.searchsorted(shape.owner, [at, at + 1])
+        return np.asarray(self.rows[key[0]].S_world_chunk.apply(shape.points[start:stop]))
+
+    def _colors_of(self, key: Key) -> Colors:
+        shape, at = self.shapes[key[0]], self._at(*key)
+        start, stop = np.searchsorted(shape.owner, [at, at + 1])
+        return shape.rgb[start:stop]
+
+    def _at(self, chunk_id: int, local_id: int) -> int:
+        return int(np.searchsorted(self.shapes[chunk_id].local_id, local_id))
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
