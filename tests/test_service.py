@@ -293,7 +293,7 @@ def test_a_client_that_takes_no_answers_is_let_go(service: Service) -> None:
 
 def test_what_is_being_answered_keeps_its_place(tmp_path: Path) -> None:
     """Two requests wait for the database, which are as many as may: others are told so, and cost them nothing."""
-    uvicorn = pytest.importorskip("uvicorn", reason="uvicorn is not installed: pip install 'list3r[serve]'")
+    uvicorn = pytest.importorskip("uvicorn", reason="uvicorn is not installed: pip install '.[serve]'")
     from list3r.server.http.app import make_service
     from list3r.server.http.limits import ServiceLimits
     from list3r.server.http.running import server_config
