@@ -74,8 +74,9 @@ def names() -> dict[tuple[str, ...], tuple[str, ...]]:
     for n in nouns:
         add(raw_words(n.name), n.name)
         add(tuple(split_words(n.name)), n.name)
+    own = frozenset(out)
     for noun, text in ((n, text) for n in nouns for text in n.synonyms):
-        for words in {raw_words(text), tuple(split_words(text))} - out.keys():
+        for words in {raw_words(text), tuple(split_words(text))} - own:
             add(words, noun.name)
     english = frozenset(out)
     for noun, text in ((n, text) for n in nouns for texts in n.foreign.values() for text in texts):
