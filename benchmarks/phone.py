@@ -42,7 +42,7 @@ from list3r.pipeline.mapping import finish_session
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer
 from list3r.simulation.rendering.sensor import sense
-from list3r.simulation.walk import look_poses
+from list3r.simulation.walk import viewing_poses
 
 Array = NDArray[np.float64]
 QUESTION = "cup on table"
@@ -83,7 +83,7 @@ class PhoneWalk(WalkSettings):
             sway = np.random.default_rng(self.seed).normal(0.0, np.radians(0.3), (2, len(yaw)))
             middle = np.array([*poses[0, :2, 3], 1.45])
             place = middle + 0.5 * np.stack([np.cos(yaw), np.sin(yaw), 0.1 * np.sin(9 * share)], axis=1)
-            poses = look_poses(place, yaw, np.radians(-20.0) + sway[0], sway[1])
+            poses = viewing_poses(place, yaw, np.radians(-20.0) + sway[0], sway[1])
         c, s = np.cos(np.radians(self.roll_deg)), np.sin(np.radians(self.roll_deg))
         turned = poses.copy()
         turned[:, :3, :3] = poses[:, :3, :3] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -121,7 +121,7 @@ def read(*words: str | Path) -> str:
 
 CASES = {
     "trajectory of nothing": ("trajectory {p}/absent.txt {p}/walk.l3r", "absent.txt"),
-    "trajectory that is none": ("trajectory {p}/note.txt {p}/walk.l3r", "note.txt line 1"),
+    "trajectory that is none": ("trajectory {p}/note.txt {p}/walk.l3r", "note.txt holds no poses; expected lines of"),
     "trajectory of another time": ("trajectory {p}/late.txt {p}/walk.l3r", "0 poses within.*one clock"),
     "trajectory of one pose": ("trajectory {p}/few.txt {p}/walk.l3r", "poses within"),
     "memory without poses": ("trajectory {p}/walk.txt {p}/empty.l3r", "no frame with a pose.*--resume"),

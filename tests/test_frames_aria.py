@@ -117,7 +117,7 @@ def test_pictures_are_turned_until_up_is_up(turns: int) -> None:
 @pytest.mark.skipif(installed, reason="the extra aria is installed")
 def test_the_extra_is_named(tmp_path: Path) -> None:
     put(tmp_path / "walk.vrs", b"x")
-    with pytest.raises(OptionError, match=r"list3r\[aria\]"):
+    with pytest.raises(OptionError, match=r"pip install .*\[aria\]"):
         open_source(tmp_path / "walk.vrs")
 
 

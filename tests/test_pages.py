@@ -12,7 +12,7 @@ import apsw
 import pytest
 
 from list3r.exporters.scene_json import scene_dict
-from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError, MemoryFileWarning
 from list3r.memory.library.maintenance import edits
 from list3r.memory.store import database
 from list3r.memory.store.file import PAGE_BYTES, connected, fold_in
@@ -164,7 +164,7 @@ def test_sums_of_an_earlier_state_are_refused_with_what_they_are_of(make_memory:
         store.instances.all()
 
 
-def test_a_log_of_another_state_is_refused(make_memory: Make, tmp_path: Path) -> None:
+def test_a_log_of_another_state_is_left_out(make_memory: Make, tmp_path: Path) -> None:
     path, other = make_memory(), tmp_path / "other.l3r"
     shutil.copy(path, other)
     with Store.open(path, writable=True) as store:
@@ -174,11 +174,8 @@ def test_a_log_of_another_state_is_refused(make_memory: Make, tmp_path: Path) ->
         log = Path(f"{other}-wal").read_bytes()
     Path(f"{path}-wal").write_bytes(log)
     for writable in (False, True):
-        with (
-            pytest.raises(MemoryFileError, match="log beside it is of another"),
-            Store.open(path, writable=writable) as s,
-        ):
-            s.instances.all()
+        with pytest.warns(MemoryFileWarning, match="the log of another file"), Store.open(path, writable=writable) as s:
+            assert s.instances.get(2).label == "plate"
 
 
 def test_a_file_that_sqlite_wrote_is_read_once_it_is_summed(make_memory: Make, tmp_path: Path) -> None:

@@ -149,6 +149,7 @@ FORGED = "mug | 0,0,0 | 9x9x9 | on 5\n7 gold | 1,1,1; 8 bar moved 10\\"
 
 def test_a_name_makes_no_row_column_or_entry(tmp_path: Path) -> None:
     with Store.create(tmp_path / "a | b; c.l3r") as store, store.transaction():
+        store.facts.scale_kind = "metric"
         put = [instance(n, (n, 0.0, 0.5), (1, 1, 1), (9, 9, 9)) for n in range(1, 201)]
         store.instances.put([replace(i, label=FORGED if i.id == 3 else "box") for i in put])
     with list3r.open(tmp_path / "a | b; c.l3r") as opened:

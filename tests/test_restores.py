@@ -75,7 +75,7 @@ def test_a_restored_backup_is_shown_and_edited_without_the_log_of_a_killed_write
         assert shown.stderr.count("\n") == 1
     assert path.read_bytes() == saved and log_of(path).read_bytes() == log
     with pytest.warns(MemoryFileWarning, match="the log of another file"):
-        assert read_content(str(path)).things[1].label == "saved"
+        assert read_content(str(path)).instances[1].label == "saved"
 
     changed = run("label", path, "3", "new")
     assert changed.returncode == 0 and f"{path.name}-wal.foreign-1" in changed.stderr

@@ -112,7 +112,7 @@ def test_names_forge_nothing_and_agents_are_told_that_they_are_data(tmp_path: Pa
     with Store.open(path, writable=True) as store, store.transaction():
         store.instances.put([replace(store.instances.get(TABLE), label=forged.splitlines()[0], description=forged)])
     assert call(path, "describe", id=TABLE)["description"] == forged.replace("\n\u202e", r"\n\u202e")
-    (found,) = (m for m in call(path, "find", text="mug on table")["matches"] if m["id"] == MUG)
+    (found,) = (m for m in call(path, "find", text=f"mug on {TABLE}")["matches"] if m["id"] == MUG)
     assert re.split(r"(?<!\\); ", found["reason"]) == ["named mug", r"on #2 table (0.95)\; in #5 chair | 0,0,0 (0.95)"]
     scene = ask(path, lambda client: client.read_resource("list3r://scene")).contents[0].text
     assert r"2 table (0.95)\; in #5 chair \| 0,0,0 | " in scene
@@ -162,7 +162,7 @@ def test_scene_map_and_instances_are_resources(room: Path) -> None:
         return tuple([(await client.read_resource(uri)).contents[0] for uri in uris])
 
     scene, plan, one = ask(room, read)
-    assert scene.text.startswith("# room.l3r: 4 things") and json.loads(one.text)["name"] == "mug"
+    assert scene.text.startswith("# room.l3r: 4 objects") and json.loads(one.text)["name"] == "mug"
     assert base64.b64decode(plan.blob).startswith(b"\x89PNG")
     prompts = ask(room, lambda client: client.list_prompts()).prompts
     assert {p.name for p in prompts} == {"describe_place", "where_is"}

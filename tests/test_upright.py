@@ -38,7 +38,7 @@ from list3r.pipeline.placing import place_chunks
 from list3r.pipeline.settings import BuildSettings
 from list3r.queries.relations import relations as find_relations
 from list3r.simulation.dataset import WalkSettings, write_walk
-from list3r.simulation.walk import look_poses
+from list3r.simulation.walk import viewing_poses
 from tests.conftest import box_points, chunk_result, local_instance, small_picture
 from tests.test_relations import kitchen
 
@@ -54,7 +54,7 @@ def held(
     roll = np.radians(rng.normal(0.0, noise_deg, count))
     pitch = np.radians(pitch_deg + rng.normal(0.0, 3.0, count))
     place = np.stack([0.5 * np.cos(yaw), 0.5 * np.sin(yaw), 1.4 + 0.02 * rng.normal(size=count)], axis=1)
-    T = look_poses(place, yaw, pitch, roll)
+    T = viewing_poses(place, yaw, pitch, roll)
     turned = T[:, :3, :3] @ rotation_exp(np.array([0.0, 0.0, np.radians(roll_deg)]))
     return Sim3(np.ones(count), turned, T[:, :3, 3])
 
@@ -165,7 +165,7 @@ def test_planes_tell_up_where_all_cameras_were_rolled_alike() -> None:
 def test_faces_look_at_the_cameras() -> None:
     rng = np.random.default_rng(0)
     floor = np.concatenate([rng.uniform(-1, 1, (800, 2)), 0.002 * rng.normal(size=(800, 1))], axis=1)
-    T = look_poses(np.array([[0.0, 0.0, 1.4]]), np.zeros(1), np.array([-0.8]), np.zeros(1))
+    T = viewing_poses(np.array([[0.0, 0.0, 1.4]]), np.zeros(1), np.array([-0.8]), np.zeros(1))
     empty = FrameSamples.empty()
     samples = replace(
         empty, points=floor.astype(np.float32), frame=np.full(800, 7), camera_frames=np.array([7]), T_chunk_cam=T

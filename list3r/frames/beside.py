@@ -30,6 +30,8 @@ _WORDS: dict[Role, tuple[str, ...]] = {
     "color": ("rgb", "color", "colour", "colors", "image", "images", "img", "imgs"),
 }
 """Words of names, the strongest first: `depth_confidence` is confidence, `depth_to_color` depth."""
+_OF_DEPTH = {"png", "exr", "raw", "mm", "map", "maps", "frame", "frames", "registered", "aligned"}
+"""Words that only say more of depth."""
 _FIRST_FOLDERS = ("images", "rgb", "color", "colour", "image")
 """Names of folders of pictures, of which a folder may have several; the first is read."""
 _DEPTH_ENDINGS = (*IMAGE_ENDINGS, ".npy", ".exr")
@@ -46,8 +48,12 @@ _CAMERA = re.compile(
 
 def role_of(name: str) -> Role | None:
     """Return what the words of a file's or folder's name say that it is; None where they say nothing."""
-    words = {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
+    words = _words(name)
     return next((role for role, known in _WORDS.items() if words & set(known)), None)
+
+
+def _words(name: str) -> set[str]:
+    return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
 
 
 def listed(folder: Path, endings: tuple[str, ...]) -> list[Path]:
@@ -279,9 +285,14 @@ def _looks_deep(path: Path) -> bool:
 def depth_beside(colors: Path) -> str:
     """Return the name of the depth that lies beside a video or a folder of pictures; empty for none.
 
-    It is a folder of depth, or, where the other says that it is colour, of the same kind as that.
+    It is a folder of depth, or, where the other says that it is colour, of the same kind as that. Where its name says
+    more, that has the other words of the first: `walk_depth` is beside `walk_rgb`, not beside `hall_rgb`.
     """
+    own = _words(colors.stem) - set(_WORDS["color"])
     for path in sorted(colors.parent.iterdir()):
+        more = _words(path.stem) - set(_WORDS["depth"]) - _OF_DEPTH
+        if more and not own <= more:
+            continue
         like = role_of(colors.stem) == "color" and path.suffix.lower() == colors.suffix.lower()
         images = listed(path, _DEPTH_ENDINGS)
         if path != colors and role_of(path.stem) == "depth" and (like or (bool(images) and _all_deep(images))):

@@ -95,7 +95,8 @@ MIGRATIONS: tuple[str, ...] = (
         component INTEGER NOT NULL CHECK (component >= 0), view_session INTEGER, view_frame INTEGER,
         view_box BLOB CHECK (length(view_box) = 32),
         dynamic INTEGER NOT NULL DEFAULT 0 CHECK (dynamic IN (0, 1)),
-        position_sigma_m REAL CHECK (position_sigma_m >= 0)) STRICT;
+        position_sigma_m REAL CHECK (position_sigma_m >= 0),
+        CHECK (abs(center_x) + abs(center_y) + abs(center_z) + size_x + size_y + size_z < 1e300)) STRICT;
     CREATE VIRTUAL TABLE instance_boxes USING rtree (id, min_x, max_x, min_y, max_y, min_z, max_z);
     CREATE VIRTUAL TABLE words USING fts5 (
         w100, w98, w90, w80, content='', contentless_delete=1, detail=column,

@@ -33,8 +33,8 @@ from list3r.memory.store.store import Store
 
 _DERIVED = ("instances", "observations", "embeddings", "relations", "events", "detected_labels")
 """Tables that consolidation writes; a row lost there is written again."""
-_PASSING = ("pair_scores",)
-"""Tables of what can be computed again."""
+_PASSING = ("pair_scores", "log_mark")
+"""Tables of what can be computed again, or belongs to the damaged file."""
 _OF_A_CHUNK = ("placements", "bends", "frames", "keyframes", "local_instances", "supports", "observations", "votes")
 _BLOBS = {"chunks": "overlap", "keyframes": "features", "local_instances": "track"}
 """Columns that must be readable as arrays for their row to be of use."""
