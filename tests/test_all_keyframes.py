@@ -87,6 +87,7 @@ def _off(S_v_u: Sim3) -> float:
     return float(np.linalg.norm(S_v_u.apply(middle) - Sim3.from_matrix(GAUGE).apply(middle)))
 
 
+@pytest.mark.slow
 def test_what_stayed_places_a_session_though_a_large_thing_that_moved_says_otherwise() -> None:
     found = _placed(_keyframes(True, True, GAUGE, 1))
     assert found and all(e.accepted and _off(e.S_v_u) < 0.03 for e in found)

@@ -97,6 +97,7 @@ def test_what_is_flagged_stays_flagged() -> None:
     assert next(i for i in flagged.instances if i.dynamic).motion is not None
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["redkitchen", "cabinet"])
 def test_real_rooms_in_which_nothing_moves_have_no_mover(name: str) -> None:

@@ -117,6 +117,7 @@ def test_surroundings_never_hold_more_instances_than_asked_for(count: int) -> No
     assert len(whole.instances.local_id) == min(count, 5)
 
 
+@pytest.mark.slow
 def test_a_room_seen_from_its_other_end_is_joined_and_a_stranger_is_not(tmp_path: Path) -> None:
     home = Home("opposite", 62, kept=(slice(-3, None), slice(1)))
     other = Home("opposite", 61, kept=(slice(0), slice(1)))

@@ -98,6 +98,7 @@ def test_nothing_is_borrowed_from_another_shot_or_from_out_of_reach() -> None:
     assert [f.index for f in near.frames] == [13, 32]
 
 
+@pytest.mark.slow
 def test_a_chunk_that_stands_still_takes_the_pose_of_its_neighbours(tmp_path: Path) -> None:
     folder = save(tmp_path / "walk", WALK)
     settings = BuildSettings("sfm", "estimate", device="cpu")
@@ -116,6 +117,7 @@ def test_a_chunk_that_stands_still_takes_the_pose_of_its_neighbours(tmp_path: Pa
     assert not alone.posed.any() and "does not move" in alone.lost_reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal", [CAMERA.fx, 1.2 * CAMERA.width], ids=["known", "guessed"])
 @pytest.mark.parametrize("known", [True, False])
 def test_a_camera_that_only_turns_makes_no_map_whatever_its_focal_length(focal: float, known: bool) -> None:

@@ -253,6 +253,7 @@ def _die_once(where: str) -> str:
     return where
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_costs_its_own_task_alone(tmp_path: Path) -> None:
     pool = TaskPool(_die_once, 1)
     flag = str(tmp_path / "died")

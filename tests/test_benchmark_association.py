@@ -31,6 +31,7 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 def test_every_variant_measures_a_video_without_loops(
     benchmark: ModuleType, capsys: pytest.CaptureFixture[str]
 ) -> None:

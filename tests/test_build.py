@@ -113,6 +113,7 @@ def test_a_killed_build_is_sound_and_resumes_to_the_same_memory(walk: Path, memo
     check_same(path, memory)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_at_once_and_says_how_to_go_on(walk: Path, memory: Path, tmp_path: Path) -> None:
     path = tmp_path / "interrupted.l3r"
     process = start(walk, path, "--poses", "estimate", "--workers", "2")

@@ -553,6 +553,7 @@ def test_a_role_that_may_only_read_asks_and_writes_nothing(server: PostgresServe
             reader.remove("shown")
 
 
+@pytest.mark.slow
 def test_a_server_that_dies_is_told_and_asked_again_when_it_is_back(server: PostgresServer) -> None:
     with Catalog.open(server.url) as catalog:
         backend = open_backend(server.url)
@@ -595,6 +596,7 @@ def test_a_lost_network_is_told_and_nothing_is_half_written(server: PostgresServ
     network.cut()
 
 
+@pytest.mark.slow
 def test_a_full_disk_of_the_server_is_told_and_changes_nothing() -> None:
     psycopg = pytest.importorskip("psycopg")
     with running_postgres() as own, small_disk(own.folder / "small") as disk:

@@ -16,9 +16,9 @@ from list3r.memory.library.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.library.change.places import Places
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.merging.edges import pair_scores
+from list3r.memory.library.overlap.point_verdicts import UNTOLD
 from list3r.memory.library.overlap.summaries import chunk_summaries
 from list3r.memory.library.overlap.visibility import (
-    UNTOLD,
     DepthView,
     VisibilitySettings,
     in_sight_of,

@@ -54,6 +54,7 @@ def visit(store: Store, changes: Mapping[str, Box | None], where: list[tuple[int
     film(store, house(changes), where)
 
 
+@pytest.mark.slow
 def test_what_was_gone_and_is_found_elsewhere_keeps_its_id(store: Store) -> None:
     visit(store, {}, EVERYWHERE)
     blue = thing_at(store, house()["thing 01"])

@@ -226,6 +226,7 @@ AS_USER = ("not a video", "all corrupt", "memory exists")
 """Cases that run as a process too: libraries that print by themselves, and the exit status."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [*CASES, *MORE_CASES])
 def test_bad_input_is_refused_in_one_line_and_leaves_nothing(
     case: str, place: Path, capfd: pytest.CaptureFixture[str]

@@ -303,6 +303,7 @@ def test_info_says_which_parts_were_not_joined(place: Path) -> None:
     assert "no chunk is stored yet" in read("info", place / "empty.l3r", "--loops")
 
 
+@pytest.mark.slow
 def test_the_plan_draws_accepted_loops(place: Path, tmp_path: Path) -> None:
     violet = np.array([118, 84, 190])
     counts = []

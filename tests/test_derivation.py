@@ -134,6 +134,7 @@ class _Undone(Exception):
     """What is only looked at."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
 def test_chunk_by_chunk_and_all_at_once_are_one_library(walks: ModuleType, tmp_path: Path, order: str) -> None:
     found = []
@@ -148,6 +149,7 @@ def test_chunk_by_chunk_and_all_at_once_are_one_library(walks: ModuleType, tmp_p
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_where_chunks_have_lain_before_does_not_matter(walks: ModuleType, store: Store) -> None:
     for index, place in enumerate(ORDERS["there and back"]):
         add(store, visit(walks, index, place))
@@ -191,6 +193,7 @@ def test_nothing_is_written_where_nothing_is_otherwise(walks: ModuleType, store:
     assert store.connection._database.total_changes() - rows <= 6 and store.embeddings.changes() == touched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [[*range(12)], ORDERS["there and back"]], ids=["rooms", "there and back"])
 def test_labels_that_grow_are_those_of_all_votes(store: Store, walks: ModuleType, order: list[int]) -> None:
     names, local = ("cup", "chair", "book"), 0
@@ -234,6 +237,7 @@ def test_what_comes_between_is_attached_and_what_is_new_is_listed(walks: ModuleT
     assert {n: o.instance_id for o in store.observations.all() if o.chunk_id == seen for n in [o.local_id]} == of_new
 
 
+@pytest.mark.slow
 def test_what_operators_parted_or_deleted_is_not_attached(walks: ModuleType, store: Store) -> None:
     for index in range(10):
         add(store, visit(walks, index, index % 2, "corridor"))
@@ -256,6 +260,7 @@ def test_a_new_chunk_is_compared_with_few_that_saw_the_place(
     assert len(store.observations.all()) == 11 * 13
 
 
+@pytest.mark.slow
 def test_relations_found_place_by_place_are_those_found_at_once(
     walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,6 +275,7 @@ def test_relations_found_place_by_place_are_those_found_at_once(
     assert len(found) > 20
 
 
+@pytest.mark.slow
 def test_little_is_kept_between_chunks_and_what_is_not_is_read_again(
     walks: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,6 +288,7 @@ def test_little_is_kept_between_chunks_and_what_is_not_is_read_again(
     check(store)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_memory_that_was_closed_grows_on(walks: ModuleType, tmp_path: Path, every: int) -> None:
     found = []
@@ -298,6 +305,7 @@ def test_a_memory_that_was_closed_grows_on(walks: ModuleType, tmp_path: Path, ev
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunks", [4, 10])
 def test_a_chunk_that_was_taken_back_leaves_no_trace(walks: ModuleType, store: Store, chunks: int) -> None:
     for index in range(chunks):
@@ -319,6 +327,7 @@ def test_a_chunk_that_was_taken_back_leaves_no_trace(walks: ModuleType, store: S
 STAY = [0, 1, 0, 1, 0, 1, 0, 1, 2, 1]
 
 
+@pytest.mark.slow
 def test_what_redundant_chunks_saw_belongs_to_the_instances_that_are_derived_without_them(
     walks: ModuleType, tmp_path: Path
 ) -> None:
@@ -409,6 +418,7 @@ def test_one_floor_goes_on_under_another_id_after_a_while(walks: ModuleType, sto
     assert all(np.ptp(i.aabb, axis=0).max() <= 20.0 for i in floors)
 
 
+@pytest.mark.slow
 def test_a_part_that_is_joined_to_another_is_merged_with_it(walks: ModuleType, store: Store) -> None:
     far = Sim3.exp(np.array([3.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     for index, place in enumerate((0, 1, 2, 3)):
@@ -423,6 +433,7 @@ def test_a_part_that_is_joined_to_another_is_merged_with_it(walks: ModuleType, s
     assert {i.component for i in store.instances.all()} == {1} and len(store.ids.aliases()) >= 12
 
 
+@pytest.mark.slow
 def test_the_word_of_operators_holds_while_the_library_grows(walks: ModuleType, store: Store) -> None:
     for index, place in enumerate((0, 1, 2)):
         add(store, visit(walks, index, place))

@@ -75,6 +75,7 @@ LATER = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derived", [True, False], ids=["with each chunk", "at the end"])
 def test_three_sessions_tell_what_they_changed(store: Store, derived: bool) -> None:
     film(store, house(), FIRST, derived=derived)
@@ -89,6 +90,7 @@ def test_three_sessions_tell_what_they_changed(store: Store, derived: bool) -> N
     assert [e for e in events(store) if e[0] == 2] == before
 
 
+@pytest.mark.slow
 def test_a_session_that_comes_in_changes_nothing_until_it_ends(store: Store) -> None:
     film(store, house(), FIRST)
     film(store, house(LATER), [(1, 0.9), (1, 2.2)])
@@ -105,6 +107,7 @@ def test_a_session_that_comes_in_changes_nothing_until_it_ends(store: Store) -> 
     assert {e.kind for e in store.events.all(session)} > {"seen_again"}
 
 
+@pytest.mark.slow
 def test_an_edit_in_a_memory_of_two_sessions_tells_the_changes_again(store: Store) -> None:
     film(store, house(), FIRST)
     film(store, house(LATER), [(1, 0.9), (1, 2.2)])
@@ -119,6 +122,7 @@ def test_an_edit_in_a_memory_of_two_sessions_tells_the_changes_again(store: Stor
     check(store)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_happens_in_sessions_is_told_alike_once_more(store: Store, seed: int) -> None:
     rng = np.random.default_rng([9, seed])

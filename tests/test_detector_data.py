@@ -46,6 +46,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_mugs_chairs_and_the_table_get_their_names(table: Path) -> None:
     with Store.open(table) as store:
         for name, pixels in TRUTH.items():

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.store.store import Store
@@ -38,6 +39,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_kill_9_during_edits_loses_nothing_that_was_committed(tmp_path: Path) -> None:
     path = tmp_path / "a.l3r"
     built(path, chunks=2).close()

@@ -61,6 +61,7 @@ def revisits() -> object:
     return revisits_figure(found.frame, found.share, judged, "loops")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
 @pytest.mark.parametrize("draw", [trajectory, cloud, instances, revisits])
 def test_every_picture_is_written_and_the_same_twice(draw: Callable[[], object], ending: str, tmp_path: Path) -> None:

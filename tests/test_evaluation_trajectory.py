@@ -315,6 +315,7 @@ def test_rpe_over_metres_agrees_with_evo(tmp_path: Path, length: float) -> None:
     assert ours.rpe_translation_m.rmse == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("truth", "estimate"),

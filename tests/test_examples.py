@@ -26,6 +26,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "rooms.l3r"
 
 
+@pytest.mark.slow
 def test_asking(memory: Path) -> None:
     assert "surface to surface" in run("02_ask.py", memory)
 
@@ -34,11 +35,13 @@ def test_graph(memory: Path) -> None:
     assert "relations" in run("03_graph.py", memory)
 
 
+@pytest.mark.slow
 def test_export(memory: Path) -> None:
     written = run("04_export.py", memory, memory.parent / "exports")
     assert all(Path(line).stat().st_size > 0 for line in written.split())
 
 
+@pytest.mark.slow
 def test_own_frames(tmp_path: Path) -> None:
     assert "things" in run("05_own_frames.py", tmp_path / "own")
 

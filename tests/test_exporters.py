@@ -115,6 +115,7 @@ def test_every_format_writes_what_it_says(name: str, make_memory: Callable[..., 
     assert {p.name for p in tmp_path.iterdir()} == before | {"room.l3r", *(p.name for p in written)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_same_memory_same_bytes(name: str, make_memory: Callable[..., Path], tmp_path: Path) -> None:
     if name == "rerun":

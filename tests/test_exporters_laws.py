@@ -67,6 +67,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SceneMemory]:
         yield memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_an_empty_memory_gives_whole_files(name: str, out: Path, tmp_path: Path) -> None:
     with Store.create(tmp_path / "empty.l3r") as store, store.transaction():
@@ -84,6 +85,7 @@ def test_one_instance_with_a_name_in_any_script(name: str, single: SceneMemory, 
     assert all(p.name.isascii() for p in written)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_an_export_replaces_its_like_and_nothing_else(name: str, single: SceneMemory, out: Path) -> None:
     place = place_of(name, out)
@@ -170,6 +172,7 @@ PLACES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are copied")
 @pytest.mark.parametrize(("name", "suffix"), PLACES)
 def test_an_export_that_is_interrupted_or_killed_leaves_whole_files(
@@ -230,6 +233,7 @@ with list3r.open(sys.argv[1]) as memory:
 """Every format against a disk that takes 100 bytes of a file."""
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_what_was_there(single: SceneMemory, out: Path) -> None:
     pytest.importorskip("resource")
     names = [name for name, form in FORMATS.items() if name != "rerun" and installed(form.package)]

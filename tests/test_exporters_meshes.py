@@ -170,6 +170,7 @@ def test_only_the_things_that_are_asked_for(room: Path, tmp_path: Path, capsys: 
         assert told in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_many_props_are_told_and_share_folders_and_processes_change_nothing(room: Path, tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
     with list3r.open(room) as memory:

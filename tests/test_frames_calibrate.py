@@ -44,6 +44,7 @@ def write_pair(root: Path, color: Camera, offset: np.ndarray, k1: float = 0.0, f
     return root
 
 
+@pytest.mark.slow
 def test_a_known_camera_is_found_from_a_wrong_start(tmp_path: Path) -> None:
     root = write_pair(tmp_path, COLOR, moved(-0.025, -0.006), k1=-0.06)
     found = calibrate(root, START, DepthCalibrationSettings(frames=12, candidates=1))

@@ -24,6 +24,7 @@ def test_redkitchen_is_recognised(shared_data: Path) -> None:
     assert 0.5 < (frame.depth > 0).mean() < 0.9 and frame.depth.max() < 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal", [525.0, 585.0])
 def test_redkitchen_calibrates_from_a_wrong_start(shared_data: Path, focal: float) -> None:
     """From 0 offset and the given focal length; known from the page of the data: 524 px, (-0.023, -0.008) m."""

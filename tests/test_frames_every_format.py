@@ -114,6 +114,7 @@ def recording(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path
     return request.param, write(tmp_path / "whole" / "walk")
 
 
+@pytest.mark.slow
 def test_a_damaged_member_is_a_bad_frame_or_one_clear_line(recording: tuple[str, Path], tmp_path: Path) -> None:
     name, path = recording
     options = OPTIONS.get(name, SourceOptions())

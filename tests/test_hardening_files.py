@@ -95,6 +95,7 @@ def test_a_lock_that_was_left_behind_is_taken_over(make_memory: Make, tmp_path: 
     assert [p.name for p in tmp_path.iterdir()] == [memory.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most_bytes", [0, 50, 8192])
 def test_an_edit_on_a_full_disk_names_the_file_and_leaves_nothing(most_bytes: int, make_memory: Make) -> None:
     def small_files() -> None:
@@ -154,6 +155,7 @@ EDITS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", EDITS)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_no_edit_makes_a_damaged_memory_verify_as_sound(damage: str, edit: str, make_memory: Make) -> None:

@@ -139,6 +139,7 @@ def test_secrets_of_an_address_are_not_shown(source: str, shown: str) -> None:
     assert not is_stream("walk.mp4") and not is_stream("c:/walk")
 
 
+@pytest.mark.slow
 def test_a_folder_that_grows_becomes_a_memory_that_can_be_asked_meanwhile(tmp_path: Path) -> None:
     whole, growing, memory = (
         write_walk(tmp_path / "w", WalkSettings(frames=24, size=(96, 72))),

@@ -147,6 +147,7 @@ def test_a_phone_is_a_stream_and_its_serial_number_is_not_shown() -> None:
     assert without_secrets("record3d:00008101-AB") == without_secrets("record3d:") == "record3d://usb"
 
 
+@pytest.mark.slow
 def test_a_walk_with_a_phone_becomes_a_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     walk = WalkSettings(frames=24, size=(96, 72))
     _, poses = walk.poses()

@@ -33,6 +33,7 @@ def placed(
         return [c.S_world_chunk for c in rows]
 
 
+@pytest.mark.slow
 def test_a_chunk_fitted_in_ends_where_solving_the_whole_graph_puts_it(tmp_path: Path) -> None:
     model = FeedForwardModel(make_video("calm", 102), seed=102)
     chunks = [model.chunk(span) for span in plan_chunks(310, ChunkSettings())]

@@ -55,6 +55,7 @@ def truth(mover: object, frames: np.ndarray) -> np.ndarray:
     return np.array([np.mean(mover(int(k)), axis=0) for k in frames])  # type: ignore[operator]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", ["given", "estimate"])
 def test_what_walks_by_is_one_dynamic_instance_with_its_track(poses: str) -> None:
     frames, result, library = built("walker", poses)

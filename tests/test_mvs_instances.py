@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from list3r.frames.base import Frame
 from list3r.instances.geometric.support import without_rims
@@ -47,6 +48,7 @@ def at(library: LocalLibrary, frame: int, T: np.ndarray, point: np.ndarray) -> L
     return None
 
 
+@pytest.mark.slow
 def test_a_box_in_the_pattern_of_the_box_under_it_is_told_from_it_in_half_of_the_textures() -> None:
     apart = 0
     for seed in (101, 103, 104, 105):

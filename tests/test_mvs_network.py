@@ -25,6 +25,7 @@ from list3r.reconstruction.mvs.weights import SHIPPED
 from tests.test_mvs import COUNT, SMALL, errors, small_scene
 
 
+@pytest.mark.slow
 def test_it_adds_depth_to_matches_and_is_as_right() -> None:
     frames, T, truth = small_scene()
     given = PosedFrames(frames, np.ones(COUNT, bool), T, SMALL)

@@ -101,6 +101,7 @@ def test_known_intrinsics_are_told_to_networks_that_listen(name: str, upstream: 
     assert np.allclose(told[:2, 2], ((width - 1) / 2 + first_centre, (height - 1) / 2 + first_centre))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pi3", "vggt", "da3"])
 def test_out_of_memory_is_met_with_shorter_windows(name: str, upstream: None, tmp_path: Path) -> None:
     frames = neural_scenes.film()

@@ -70,6 +70,7 @@ def check_trajectory(memory: Path) -> None:
     assert errors.ate_sim3_m.rmse < 0.01 and errors.rpe_rotation_deg.rmse < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pi3", "mapanything"])
 def test_pictures_become_a_memory(name: str, upstream: None, pictures: Path, tmp_path: Path) -> None:
     neural_scenes.weights(name, tmp_path / "weights", neural_scenes.film())
@@ -86,6 +87,7 @@ def test_pictures_become_a_memory(name: str, upstream: None, pictures: Path, tmp
     check_trajectory(tmp_path / "m.l3r")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vggt", "da3", "pi3x"])
 def test_a_chunk_goes_through_every_stage(name: str, upstream: None, pictures: Path, tmp_path: Path) -> None:
     weights = neural_scenes.weights(name, tmp_path / "weights", neural_scenes.film())
@@ -97,6 +99,7 @@ def test_a_chunk_goes_through_every_stage(name: str, upstream: None, pictures: P
     assert abs(result.intrinsics[0] / 262.0 - 1) < 0.03, "the focal length is the network's, not the guess"
 
 
+@pytest.mark.slow
 def test_geometry_written_in_one_place_is_built_in_another(
     upstream: None, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -166,6 +169,7 @@ def test_chunks_are_as_long_as_the_gpu_holds(monkeypatch: pytest.MonkeyPatch) ->
         length(4_000)
 
 
+@pytest.mark.slow
 def test_windows_of_two_places_are_made_by_the_chunks_own_network(
     upstream: None, pictures: Path, tmp_path: Path
 ) -> None:
@@ -194,6 +198,7 @@ def test_windows_of_two_places_are_made_by_the_chunks_own_network(
     assert set(made.u.camera_frames) == {0, 1, 2, 3} and set(made.v.camera_frames) == {8, 9, 10, 11}
 
 
+@pytest.mark.slow
 def test_an_update_and_a_resumed_build_take_the_same_options(
     upstream: None, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -208,6 +213,7 @@ def test_an_update_and_a_resumed_build_take_the_same_options(
     assert report["posed"] == 10
 
 
+@pytest.mark.slow
 def test_every_part_can_be_a_network(
     upstream: None, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -69,6 +69,7 @@ def test_point_grid_finds_masks(model: str, checkpoints: dict[str, Path], chunk)
     assert (np.diff(masks.score) <= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["sam2", "sam3", "edgetam"])
 def test_tracker_follows_prompts_through_the_chunk(model: str, checkpoints: dict[str, Path]) -> None:
     frames, reconstruction = walk(SCENE, 6)
@@ -87,6 +88,7 @@ def half_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pretrained, "network_dtype", lambda device: torch.bfloat16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(neural_models._MAKERS))
 def test_every_network_runs_in_half_precision(
     name: str, half_precision: None, checkpoints: dict[str, Path], chunk

@@ -86,6 +86,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_every_frame_has_a_pose_and_every_third_has_depth(pictures: Path) -> None:
     settings = BuildSettings("sfm", "estimate", device="cpu", chunks=ChunkSettings(10, 3))
     task = ChunkTask(str(pictures), OPTIONS, ChunkSpan(0, 0, 30), settings, None, (0, 30), 3)
@@ -99,6 +100,7 @@ def test_every_frame_has_a_pose_and_every_third_has_depth(pictures: Path) -> Non
     assert np.linalg.norm(S.apply(made.T_chunk_cam[:, :3, 3]) - truth, axis=1).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_build_says_it_and_goes_on_as_it_began(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

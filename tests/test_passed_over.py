@@ -136,6 +136,7 @@ def test_where_a_frame_cannot_be_decoded_all_are_read(walk: Path, tmp_path: Path
     assert made.frame_indices[made.posed].tolist() == [k for k in range(COUNT) if k not in (4, 7)]
 
 
+@pytest.mark.slow
 def test_a_build_is_the_same_with_any_number_of_processes(walk: Path, tmp_path: Path) -> None:
     found = []
     for workers in ("0", "2"):

@@ -121,6 +121,7 @@ def test_alignment_of_exact_points_is_exact_and_outliers_count_less() -> None:
     assert error[0] < 0.5 * error[1]
 
 
+@pytest.mark.slow
 def test_a_ring_closes_and_shares_its_error_evenly() -> None:
     step = Sim3.exp(np.array([1.0, 0, 0, 0, 0, 2 * np.pi / 12, 0.0]))
     drift = Sim3.exp(np.array([0.0, 0, 0.02, 0, 0.0, 0.01, 0.02]))

@@ -51,6 +51,7 @@ QUESTIONS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", QUESTIONS)
 def test_a_question_is_answered_without_file_locks(words: tuple[str, ...], memory: Path) -> None:
     said = run(memory, *words, "--json", before="sys.modules['fcntl'] = None")

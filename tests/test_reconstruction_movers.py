@@ -41,6 +41,7 @@ def place(k: int) -> tuple[float, float, float]:
     return 0.2 * np.sin(SPEED_M_PER_S / 0.2 * k / 30), 0.03, 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 12])
 def test_a_near_mover_does_not_drag_the_camera(first: int) -> None:
     poses = walk(24)

@@ -83,6 +83,7 @@ def test_frames_without_depth_are_lost(frames: list[Frame]) -> None:
     assert not result.confidence[3].any()
 
 
+@pytest.mark.slow
 def test_a_cut_to_a_seen_place_is_attached_again(truth: np.ndarray) -> None:
     poses = np.concatenate([walk(25), walk(20, start=2.0)])
     result = RgbdReconstructor()(frames_along(poses), CAMERA)
@@ -120,6 +121,7 @@ def test_a_step_that_features_tell_beyond_doubt_is_searched_for_once(monkeypatch
     assert shift.max() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", [(70, 71, 72, 73), (68, 69, 71, 72, 73)])
 def test_a_motion_that_nothing_foretells_is_searched_for(numbers: tuple[int, ...]) -> None:
     """Three degrees and a bare wall: from no motion a frame falls into a false minimum 5 cm off."""
@@ -208,6 +210,7 @@ def _looking_at_wall(distance: float, turn_deg: float) -> np.ndarray:
     return T
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_second_of_the_kitchen(shared_data: Path) -> None:
     source = open_source(shared_data / "redkitchen", SourceOptions())

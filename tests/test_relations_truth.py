@@ -47,6 +47,7 @@ def test_round_things_have_no_corners() -> None:
     assert surface_gap(bowl, cube(7, 0.0, 0.0, z=0.3)) == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_is_that_of_the_nearest_of_many_surface_points(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -152,6 +152,7 @@ def test_a_copy_by_vacuum_is_another_file_and_of_another_program(make_memory: Ma
     assert (copy.read_bytes(), log_of(copy).read_bytes()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
 def test_half_a_copy_is_refused_and_left(share: float, tmp_path: Path) -> None:
     path = tmp_path / "room.l3r"

@@ -45,6 +45,7 @@ def write_room(path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_build_killed_before_its_first_chunk_can_be_opened_and_resumed(walk: Path, tmp_path: Path) -> None:
     memory = tmp_path / "killed.l3r"
     assert build_ended(walk, memory, "os._exit(9)").returncode == 9
@@ -58,6 +59,7 @@ def test_a_build_killed_before_its_first_chunk_can_be_opened_and_resumed(walk: P
         assert len(scene.store.trajectory.poses()) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_build_that_is_told_to_end_leaves_nothing_half_written(name: str, walk: Path, tmp_path: Path) -> None:
     workers = ["--workers", "1" if name == "SIGTERM" else "0"]
@@ -78,6 +80,7 @@ signalled("{name}", module.{owner}.{name})
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--force"]])
 @pytest.mark.parametrize("where", ["Store.close", "Connection._connect"])
 def test_ctrl_c_while_a_memory_is_made_or_given_up_leaves_none(
@@ -108,6 +111,7 @@ def test_what_is_said_of_an_interrupted_build_is_true(tmp_path: Path) -> None:
     assert "room.l3r.replaced" in said(False)
 
 
+@pytest.mark.slow
 def test_an_interrupted_replacement_leaves_the_old_memory(walk: Path, tmp_path: Path) -> None:
     memory = write_room(tmp_path / "room.l3r")
     result = build_ended(walk, memory, "raise KeyboardInterrupt", "--force")
@@ -117,6 +121,7 @@ def test_an_interrupted_replacement_leaves_the_old_memory(walk: Path, tmp_path: 
     assert [p.name for p in tmp_path.iterdir()] == ["room.l3r"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--force", "--resume"])
 def test_a_killed_replacement_leaves_nothing_aside_in_the_end(option: str, walk: Path, tmp_path: Path) -> None:
     memory = write_room(tmp_path / "room.l3r")
@@ -144,6 +149,7 @@ def test_a_memory_behind_a_link_is_written_there(walk: Path, tmp_path: Path) -> 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.l3r", "real.l3r"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["list", "info", "verify", "query relations"])
 def test_output_that_nobody_reads_is_no_failure(command: str, tmp_path: Path) -> None:
     memory = write_room(tmp_path / "room.l3r")

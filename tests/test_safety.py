@@ -65,16 +65,19 @@ def killed_build(safety: ModuleType, tmp_path_factory: pytest.TempPathFactory) -
     return safety.kill_builds(walk, folder, 1), folder / "whole.l3r"
 
 
+@pytest.mark.slow
 def test_a_killed_build_loses_nothing_and_is_completed(killed_build: tuple[dict[str, Any], Path]) -> None:
     report, _ = killed_build
     assert report["problems"] == [] and report["kills"] == 1
 
 
+@pytest.mark.slow
 def test_killed_transactions_are_whole_or_not_there(safety: ModuleType, make_memory: Make) -> None:
     report = safety.kill_writes(make_memory(), 3)
     assert report["problems"] == [] and report["transactions"] >= 3
 
 
+@pytest.mark.slow
 def test_a_killed_update_and_killed_edits_lose_nothing(
     safety: ModuleType, killed_build: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
@@ -88,6 +91,7 @@ def test_a_killed_update_and_killed_edits_lose_nothing(
     assert report["problems"] == [] and report["kills"] == 1
 
 
+@pytest.mark.slow
 def test_readers_in_other_processes_see_whole_transactions(safety: ModuleType, make_memory: Make) -> None:
     report = safety.write_and_read(make_memory(), 2.0, readers=2)
     assert report["problems"] == []

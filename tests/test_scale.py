@@ -56,6 +56,7 @@ def middling(store: Store) -> Instance:
     return sorted(found, key=lambda i: float(i.box.size.max()))[len(found) // 2]
 
 
+@pytest.mark.slow
 def test_a_memory_without_scale_says_so(memory: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with open_scene(memory) as scene:
         assert scene.units == "unit" and scene.store.facts.scale_kind == "relative"

@@ -45,6 +45,7 @@ def test_the_papers_sequences_are_found_and_missing_ones_named(
     assert missing == len(sequences.DATA_SETS[data].scenes) - (1 if data == "bonn" else expected)
 
 
+@pytest.mark.slow
 def test_eth3d_and_bonn_are_built_and_evaluated_from_their_layouts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -213,6 +213,7 @@ async def told_by_all(client: Client) -> dict[str, Any]:
     return {name: answer.structured_content or answer.content[0].mime_type for name, answer in asked.items()}
 
 
+@pytest.mark.slow
 def test_over_stdio(tmp_path: Path) -> None:
     path = write_room(tmp_path / "room.l3r")
 

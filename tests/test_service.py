@@ -269,6 +269,7 @@ def test_every_request_of_a_connection_has_its_limit_of_time(service: Service) -
         assert {client.recv(1000) for client in (*half, *idle)} == {b""}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("texts", [(), (ANSWERED, WAITING), (WAITING,), (BODY,)])
 def test_slow_clients_make_room_for_others(service: Service, texts: tuple[str, ...]) -> None:
     """Those of the same address, too, and those first that have waited longest."""

@@ -65,6 +65,7 @@ def interrupt(path: Path, walk: Path) -> None:
         update(path, walk, settings=SETTINGS, run=RunOptions(workers=0), watch=Watch(stop))
 
 
+@pytest.mark.slow
 def test_the_second_session_lies_in_the_world_of_the_first(two: Path, one: Path) -> None:
     with Store.open(two) as store, Store.open(one) as before:
         assert {c.component for c in store.chunks.all()} == {store.chunks.all()[0].component}
@@ -109,6 +110,7 @@ def test_the_program_says_in_one_line_what_is_wrong(
     assert all(line.startswith("error: ") for line in lines)
 
 
+@pytest.mark.slow
 def test_an_interrupted_update_goes_on_to_the_same_memory(
     one: Path, two: Path, walks: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -133,6 +135,7 @@ def test_an_interrupted_update_goes_on_to_the_same_memory(
         assert store.verify() == []
 
 
+@pytest.mark.slow
 def test_an_interrupted_update_can_be_given_up(one: Path, walks: tuple[Path, Path], tmp_path: Path) -> None:
     path = tmp_path / "given-up.l3r"
     shutil.copy(one, path)
@@ -148,6 +151,7 @@ def test_an_interrupted_update_can_be_given_up(one: Path, walks: tuple[Path, Pat
         assert len(store.sessions.all()) == 2 and store.verify() == []
 
 
+@pytest.mark.slow
 def test_a_video_in_which_no_camera_is_placed_leaves_the_memory_as_it_was(one: Path, tmp_path: Path) -> None:
     path, black = tmp_path / "as-it-was.l3r", tmp_path / "black"
     shutil.copy(one, path)

@@ -78,6 +78,7 @@ def made():
     return SfmReconstructor()(walk(), CAMERA)
 
 
+@pytest.mark.slow
 def test_poses_are_the_true_ones_but_for_the_scale(made):
     assert made.posed.all() and made.scale_kind == "relative"
     truth, found = centres(walk()), made.T_chunk_cam[:, :3, 3]
@@ -102,6 +103,7 @@ def test_depth_fits_the_poses(made):
     assert np.median(np.abs(made.depth[0][known] * float(S.scale) / truth[known] - 1)) < 0.05
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_numbers(made):
     once = QUICK(walk(), CAMERA)
     np.testing.assert_array_equal(once.T_chunk_cam, made.T_chunk_cam)
@@ -110,6 +112,7 @@ def test_the_same_frames_give_the_same_numbers(made):
     np.testing.assert_array_equal(once.depth, again.depth)
 
 
+@pytest.mark.slow
 def test_given_poses_are_kept_and_make_it_metric():
     made = make_reconstructor("sfm", ModelOptions(poses="given", device="cpu"))(walk(), CAMERA)
     assert made.scale_kind == "metric" and made.posed.all()
@@ -128,6 +131,7 @@ def test_black_frames_are_left_out_and_the_rest_keeps_together():
     assert np.linalg.norm(S.apply(made.T_chunk_cam[posed, :3, 3]) - centres(walk())[posed], axis=1).max() < 0.015
 
 
+@pytest.mark.slow
 def test_a_jump_to_another_place_parts_the_chunk():
     first, count = walk()[:14], 12
     other = [
@@ -142,6 +146,7 @@ def test_a_jump_to_another_place_parts_the_chunk():
     assert not whole.posed[len(first) :].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frames", "said"),
     [
@@ -213,6 +218,7 @@ def test_corners_are_followed_on_few_levels_as_on_all_and_a_jerk_is_caught():
         assert np.quantile(np.linalg.norm(few.xy[k][a] - all_.xy[k][b], axis=1), 0.95) < 0.05
 
 
+@pytest.mark.slow
 def test_the_camera_is_found_and_a_wrong_one_is_doubted():
     settings = SfmSettings(calibration=CameraCalibrationSettings(windows=1, frames=FRAMES))
     found = calibrate(Held(walk(), None), settings)
@@ -231,6 +237,7 @@ def test_sfm_is_known_by_name_and_needs_neither_depth_nor_camera():
     assert not MODELS["sfm"].needs_depth and not MODELS["sfm"].needs_camera
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_redkitchen_in_colour(shared_data: Path):
     source = open_source(shared_data / "redkitchen", SourceOptions(start=200, stop=240))

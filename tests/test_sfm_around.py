@@ -49,6 +49,7 @@ def test_a_frame_around_that_cannot_be_decoded_is_left_out() -> None:
     assert [f.index for f in early] == [4]
 
 
+@pytest.mark.slow
 def test_frames_around_help_and_are_no_part_of_the_chunk() -> None:
     asked: list[tuple[int, int]] = []
 
@@ -64,6 +65,7 @@ def test_frames_around_help_and_are_no_part_of_the_chunk() -> None:
     assert np.linalg.norm(S.apply(part.T_chunk_cam[:, :3, 3]) - centres(chunk), axis=1).max() < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_chunk_with_little_motion_is_not_bent(shared_data: Path) -> None:
     """The camera moves 0.2 m and sees 0.8 to 3 m deep: alone, the near comes out 1.2 times too far by the far."""

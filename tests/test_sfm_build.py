@@ -48,6 +48,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(tmp_path_factory.mktemp("sfm") / "walk", [pose(k) for k in range(COUNT)])
 
 
+@pytest.mark.slow
 def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path):
     memory = tmp_path / "walk.l3r"
     settings = BuildSettings(reconstruction="auto", poses="auto", chunks=ChunkSettings(18, 8))
@@ -66,6 +67,7 @@ def test_pictures_alone_become_a_relative_memory(pictures: Path, tmp_path: Path)
     assert list3r.open(memory) is not None
 
 
+@pytest.mark.slow
 def test_the_camera_is_the_same_wherever_its_windows_are_mapped(pictures: Path) -> None:
     settings = BuildSettings("sfm", "estimate", device="cpu")
     short = replace(settings.models.sfm.calibration, windows=3, frames=13, least_frames=13)
@@ -79,12 +81,14 @@ def test_the_camera_is_the_same_wherever_its_windows_are_mapped(pictures: Path) 
     assert there is not None and there == estimated_camera(open_source(pictures), SourceOptions(), settings)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_a_video_that_cannot_be_followed(tmp_path: Path):
     folder = save(tmp_path / "still", [pose(0)] * 5)
     with pytest.raises(TrackingError, match="does not move"):
         build(folder, tmp_path / "still.l3r", settings=BuildSettings("auto", "auto"), run=RunOptions(workers=1))
 
 
+@pytest.mark.slow
 def test_parts_of_a_chunk_are_numbered_so_that_the_last_closes_the_span(tmp_path: Path):
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
     there = [pose(k) @ away for k in range(14)]
@@ -97,6 +101,7 @@ def test_parts_of_a_chunk_are_numbered_so_that_the_last_closes_the_span(tmp_path
     assert first.frame_indices[-1] < last.frame_indices[0] and first.posed.all() and last.posed.all()
 
 
+@pytest.mark.slow
 def test_files_for_another_machine_have_one_estimated_camera_and_say_it(pictures: Path, tmp_path: Path) -> None:
     settings = BuildSettings(reconstruction="sfm", chunks=ChunkSettings(18, 8))
     told: list[str] = []
@@ -113,6 +118,7 @@ def test_files_for_another_machine_have_one_estimated_camera_and_say_it(pictures
     assert all(read_piece(p).depth_noise is not None for p in (tmp_path / "files").glob("*.npz"))
 
 
+@pytest.mark.slow
 def test_files_hold_frames_of_a_chunk_that_stands_still(tmp_path: Path) -> None:
     folder = save(tmp_path / "stops", [pose(k) for k in range(18)] + [pose(17)] * 12)
     options = SourceOptions(intrinsics=(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), distortion=())

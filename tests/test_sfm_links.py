@@ -45,6 +45,7 @@ def segments(frames: tuple[Frame, ...], camera: Camera, detector: LearnedDetecto
     return model._segments(frames, grays, camera)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(("kind", "every"), [("sift", 16), ("aliked/aliked-t16.pth", 20)])
 def test_frames_far_apart_are_posed_together(kind: str, every: int, shared_data: Path):

@@ -119,6 +119,7 @@ def test_fewer_frames_cut_the_walk_and_more_slow_it() -> None:
 # ----------------------------------------------------------------------------------------------- renderer
 
 
+@pytest.mark.slow
 def test_every_point_lies_in_the_box_of_its_thing(world: SimulatedWorld) -> None:
     renderer = Renderer(world, CAMERA)
     boxes = {t.id: t.box() for t in world.objects}
@@ -192,6 +193,7 @@ def test_the_nearer_thing_hides_the_farther_whatever_the_order() -> None:
         assert frame.ids[10, 10] == 2
 
 
+@pytest.mark.slow
 def test_surfaces_have_texture_to_hold_on_to(world: SimulatedWorld) -> None:
     _, poses = camera_path(world.tour, None, PathSettings())
     renderer = Renderer(world, CAMERA)

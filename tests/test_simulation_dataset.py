@@ -55,6 +55,7 @@ def test_points_of_all_frames_agree_on_the_things(walk: Path) -> None:
     assert np.quantile(np.concatenate(distances), 0.95) < 0.03
 
 
+@pytest.mark.slow
 def test_processes_do_not_change_a_byte(walk: Path, tmp_path: Path) -> None:
     again = write_walk(tmp_path / "again", SETTINGS, workers=2)
     names = sorted(p.relative_to(walk) for p in walk.rglob("*") if p.is_file())

@@ -63,6 +63,7 @@ def side_error(video: SimulatedVideo, u: FrameSamples, v: FrameSamples) -> float
     return float(np.linalg.norm(S_u.apply(S_v.inverse().apply(middle)) - middle))
 
 
+@pytest.mark.slow
 def test_same_seed_same_chunk_and_another_seed_another(video: SimulatedVideo) -> None:
     one, two, other = (FeedForwardModel(video, seed=n).chunk(SPAN) for n in (5, 5, 6))
     for f in fields(FrameSamples):
@@ -90,6 +91,7 @@ def test_exact_settings_give_the_truth_up_to_a_similarity(video: SimulatedVideo)
     assert len({float(fit(video, FeedForwardModel(video, seed=n).chunk(SPAN).samples)[0].scale) for n in range(3)}) == 3
 
 
+@pytest.mark.slow
 def test_two_cameras_in_one_window_see_the_same_room() -> None:
     """Where a second camera takes over, its points lie on what the first one saw, in truth and in a window of both."""
     video = make_return("seasons", 103)
@@ -203,6 +205,7 @@ def test_frame_rate_does_not_change_the_errors() -> None:
     assert 0.7 < spread[1] / spread[0] < 1.4
 
 
+@pytest.mark.slow
 def test_a_window_of_one_place_is_right_and_of_two_made_up(twins: SimulatedVideo) -> None:
     model = FeedForwardModel(twins, seed=3)
     frames = np.arange(10, len(twins.time_s) - 10, 10)
@@ -224,6 +227,7 @@ def test_a_window_of_one_place_is_right_and_of_two_made_up(twins: SimulatedVideo
     assert np.linalg.norm(middle[0] - middle[1]) < size
 
 
+@pytest.mark.slow
 def test_over_a_cut_each_side_is_right_and_their_relation_is_not() -> None:
     video = make_video("kidnap", 131)
     assert video.cuts

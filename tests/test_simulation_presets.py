@@ -45,6 +45,7 @@ def angles(poses: np.ndarray) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------- casting
 
 
+@pytest.mark.slow
 def test_the_fast_caster_and_the_renderer_see_the_same() -> None:
     camera = preset_camera((64, 48))
     world = make_world(1)
@@ -105,6 +106,7 @@ def test_a_person_could_film_it(preset: str, seed: int) -> None:
     assert (len(film.movers) > 0) == (preset == "dynamic")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_building_is_closed_and_the_camera_in_the_open(preset: str) -> None:
     film = video(preset)
@@ -143,6 +145,7 @@ def test_what_makes_no_sense_is_named() -> None:
 # ----------------------------------------------------------------------------------------------- each preset
 
 
+@pytest.mark.slow
 def test_a_loop_comes_back_and_goes_on_along_its_old_path() -> None:
     film = video("loop")
     xy = film.T_world_cam[:, :2, 3]
@@ -154,6 +157,7 @@ def test_a_loop_comes_back_and_goes_on_along_its_old_path() -> None:
     assert covisibility(film, early, end).max() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [101, 102, 103, 104])
 def test_a_kidnapped_camera_wakes_where_it_has_been(seed: int) -> None:
     film = video("kidnap", seed)
@@ -162,6 +166,7 @@ def test_a_kidnapped_camera_wakes_where_it_has_been(seed: int) -> None:
         assert covisibility(film, np.arange(0, cut - 240, 3), [cut]).max() > 0.3
 
 
+@pytest.mark.slow
 def test_cuts_fall_anywhere_in_the_chunks_and_some_videos_have_two() -> None:
     cuts = [shot("kidnap", seed).cuts for seed in range(101, 113)]
     assert {len(c) for c in cuts} == {1, 2}
@@ -182,6 +187,7 @@ def test_twins_look_alike_and_are_two_places() -> None:
     assert covisibility(film, back[: gap + 1 : 4], back[gap + 1 :: 4]).max() > 0.5
 
 
+@pytest.mark.slow
 def test_movers_fill_the_picture_and_are_gone_on_request() -> None:
     film, still = video("dynamic"), video("dynamic", movers=False)
     assert np.array_equal(film.T_world_cam, still.T_world_cam) and film.world == still.world
@@ -206,6 +212,7 @@ def test_a_thing_is_carried_away_while_it_is_filmed() -> None:
     assert speed.max() < 3
 
 
+@pytest.mark.slow
 def test_sparse_rooms_hold_little_and_a_corridor_is_long() -> None:
     def per_frame(preset: str) -> float:
         return float(np.mean([len(np.unique(ids)) for ids in video(preset).ids[::10]]))
@@ -242,6 +249,7 @@ def test_what_moves_is_no_common_surface() -> None:
 # ----------------------------------------------------------------------------------------------- with colour
 
 
+@pytest.mark.slow
 def test_a_preset_is_written_as_a_sequence_with_its_movers(tmp_path: Path) -> None:
     settings = PresetWalk(seed=101, preset="dynamic", frames=4, start=500, size=(64, 48), write_ids=True)
     root = write_walk(tmp_path / "dynamic", settings)

@@ -29,6 +29,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -47,6 +48,7 @@ def test_asking_takes_none_of_the_extras(words: tuple[str, ...], memory: str) ->
     assert said.returncode == 0 and "error" not in said.stderr, said.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "extra"),
     [

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from list3r.frames.base import BadFrame, Frame, SourceInfo
 from list3r.frames.chunking.borrowing import borrow
@@ -64,6 +65,7 @@ class Pictures:
         return index
 
 
+@pytest.mark.slow
 def test_a_chunk_of_a_hand_that_trembles_takes_its_poses_from_frames_around_it(tmp_path: Path) -> None:
     for k in range(COUNT):
         cv2.imwrite(str(tmp_path / f"{k:04d}.png"), picture(k)[..., ::-1])

@@ -84,6 +84,7 @@ def test_a_narrow_terminal_folds_words_and_keeps_numbers_whole(named: Path) -> N
     assert "".join(re.findall("[杯子]", "".join(rows))) == "杯子" * 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "environment"), [(40, {}), (100, {"TERM": "dumb"})])
 def test_a_terminal_that_cannot_show_a_table_gets_plain_lines(
     width: int, environment: dict[str, str], named: Path

@@ -24,6 +24,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
+@pytest.mark.slow
 def test_keyframes_are_made_once_and_their_likeliest_planes_are_mostly_true(room: Path) -> None:
     costs, picture, place, side = (np.load(room / f"{name}.npy") for name in PARTS)
     count, planes, height, width = costs.shape

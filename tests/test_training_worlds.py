@@ -180,6 +180,7 @@ def test_what_is_built_in_stands_in_the_room_and_structure_is_none_of_it() -> No
     assert make_world(2).things[6:] != worlds[0].things[6:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [12, 13])
 def test_what_closes_an_opening_lies_behind_the_face_of_its_wall_and_leaves_no_hole(seed: int) -> None:
     world = make_world(seed, recessed=True)
@@ -221,6 +222,7 @@ def _sides(along: np.ndarray, across: float) -> list[np.ndarray]:
     return [np.column_stack([along, fixed]), np.column_stack([fixed, along])]
 
 
+@pytest.mark.slow
 def test_swept_depth_lies_on_what_was_filmed_and_is_no_copy_of_it() -> None:
     pytest.importorskip("torch")
     from training.samples import sample_of

@@ -78,6 +78,7 @@ def built(folder: Path, memory: Path, poses: str = "auto", **more: object) -> Bu
 STRETCHES = {"first": range(0, 10), "middle": range(8, 18), "last": range(16, 26), "two": range(8, 26)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", ["estimate", "given"])
 @pytest.mark.parametrize("where", STRETCHES)
 def test_a_chunk_without_a_usable_frame_takes_part_in_nothing(where: str, poses: str, tmp_path: Path) -> None:
@@ -126,6 +127,7 @@ def test_empty_files_are_counted_where_most_frames_are_never_looked_at(tmp_path:
     assert (report.posed, report.bad) == (COUNT - 2, 2)
 
 
+@pytest.mark.slow
 def test_an_interrupted_build_goes_on_over_what_cannot_be_used(tmp_path: Path) -> None:
     folder, memory = write(tmp_path / "walk", range(8, 18)), tmp_path / "m.l3r"
 
@@ -147,6 +149,7 @@ def test_an_interrupted_build_goes_on_over_what_cannot_be_used(tmp_path: Path) -
             np.testing.assert_array_equal(a[1].as_matrix(), b[1].as_matrix())
 
 
+@pytest.mark.slow
 def test_a_later_video_with_nothing_in_a_chunk_is_placed(tmp_path: Path) -> None:
     first, later = write(tmp_path / "first"), write(tmp_path / "later", range(0, 10), first=2)
     memory = tmp_path / "m.l3r"
@@ -177,12 +180,14 @@ def test_where_no_frame_can_be_used_one_line_says_so_and_nothing_is_left(tmp_pat
     assert [p.name for p in tmp_path.iterdir()] == ["walk"]
 
 
+@pytest.mark.slow
 def test_processes_side_by_side_pass_over_what_cannot_be_used(tmp_path: Path) -> None:
     folder = write(tmp_path / "walk", range(8, 18))
     report = build(folder, tmp_path / "m.l3r", options=options(), settings=REQUEST, run=RunOptions(workers=2))
     assert (report.posed, report.bad, report.chunks) == (16, 10, 3)
 
 
+@pytest.mark.slow
 def test_a_live_folder_goes_on_after_a_stretch_without_depth(tmp_path: Path) -> None:
     folder = write(tmp_path / "walk", range(8, 18), poses=True)
     quick = LiveSettings(idle_s=1.0, poll_s=0.05)
@@ -192,6 +197,7 @@ def test_a_live_folder_goes_on_after_a_stretch_without_depth(tmp_path: Path) -> 
     assert (report.posed, report.bad, report.chunks, report.components) == (16, 10, 3, 1)
 
 
+@pytest.mark.slow
 def test_a_colour_video_with_an_empty_stretch_is_a_memory_of_the_rest(tmp_path: Path) -> None:
     folder = save(tmp_path / "walk", [*range(14), *[0] * 24])
     for path in sorted(folder.iterdir())[12:]:
@@ -240,6 +246,7 @@ def test_inspect_says_from_which_frame_on_files_are_empty_or_missing(tmp_path: P
     assert shown.returncode == 0 and "unusable     " in shown.stdout and "all of these from frame 16 on" in shown.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [range(0, 12), range(14, COUNT)])
 def test_pictures_of_another_size_are_named_and_left_out(turned: Collection[int], tmp_path: Path) -> None:
     folder = write(tmp_path / "walk")
@@ -336,6 +343,7 @@ def harmed(folder: Path, seed: int) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_any_damage_is_left_out_or_refused_in_one_line(seed: int, tmp_path: Path) -> None:
     folder, memory = harmed(tmp_path / "walk", seed), tmp_path / "m.l3r"
@@ -361,6 +369,7 @@ def test_any_damage_is_left_out_or_refused_in_one_line(seed: int, tmp_path: Path
 # ------------------------------------------------------------------------------------------ the cases as they came
 
 
+@pytest.mark.slow
 def test_the_walk_whose_depth_ends_early_is_a_memory_of_its_beginning(shared_data: Path, tmp_path: Path) -> None:
     walk = shared_data / "cases/empty_chunk_crash/walk"
     if not walk.is_dir():
@@ -371,6 +380,7 @@ def test_the_walk_whose_depth_ends_early_is_a_memory_of_its_beginning(shared_dat
     assert run("build", walk, "-m", tmp_path / "m.l3r", *words, "--resume").returncode == 0
 
 
+@pytest.mark.slow
 def test_the_film_with_zeros_in_it_is_a_memory_of_what_lies_before(shared_data: Path, tmp_path: Path) -> None:
     film = shared_data / "cases/damaged_video_crash/half.mp4"
     if not film.is_file():

@@ -58,6 +58,7 @@ def write(kind: str, root: Path) -> Path:
     return writer(root)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KNOW_GRAVITY)
 def test_the_vertical_is_the_recorders_whichever_way_the_phone_is_held(kind: str, turns: int, tmp_path: Path) -> None:
     source, memory = write(kind, tmp_path / "recording"), tmp_path / "a.l3r"

@@ -54,6 +54,7 @@ def test_the_sdist_holds_what_the_wheel_is_made_of(distributions: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_fresh_environment_asks_a_memory_and_names_what_it_lacks(wheel: Path, tmp_path: Path) -> None:
     python = tmp_path / "venv/bin/python"
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True, timeout=300)
@@ -122,6 +123,7 @@ def lend_machine_code(site: Path) -> None:
                 shutil.copy(file, copy.parent / "__pycache__")
 
 
+@pytest.mark.slow
 def test_installed_elsewhere_it_runs_the_demo(wheel: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]

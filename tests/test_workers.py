@@ -222,6 +222,7 @@ with OrderedPool(here.sleep, 2) as pool:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
 def test_workers_end_when_their_parent_is_ended(tmp_path: Path, how: signal.Signals) -> None:
     script = run_script(tmp_path, BUSY)
