@@ -112,7 +112,7 @@ def test_a_step_that_features_tell_beyond_doubt_is_searched_for_once(monkeypatch
     """Every other keyframe and the starts all round cost four times as much and lead to the same place."""
     asked: list[int] = []
     guess = CameraTracker._feature_guess
-    monkeypatch.setattr(CameraTracker, "_feature_guess", lambda self, a, b: asked.append(b) or guess(self, a, b))
+    monkeypatch.setattr(CameraTracker, "_feature_guess", lambda self, s, a, b: asked.append(b) or guess(self, s, a, b))
     monkeypatch.setattr(CameraTracker, "_sweep", lambda *_: pytest.fail("it was looked for all round"))
     poses = walk(6, speed=15.0)
     shift, _ = pose_errors(RgbdReconstructor()(frames_along(poses, step_s=0.5), CAMERA).T_chunk_cam, poses)
