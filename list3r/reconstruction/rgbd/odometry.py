@@ -327,24 +327,36 @@ class CameraTracker:
         T_guess: Pose,
         blind: bool = False,
         prior: PosePrior | None = None,
+        features: VerifiedFeatures | None = None,
     ) -> FrameRegistration | None:
-        """Register the frame to the segment's model from a guess, kept only when it is reliable."""
+        """Register the frame to the segment's model from a guess, kept only when it is reliable.
+
+        `features` that prove it stand in for the agreement of brightness, which reflections and exposure spoil.
+        """
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         s, view = self.settings, self.view(position)
         found = register(samples, view, T_guess, s.registration, s.noise, prior)
         if found is not None and not blind:
             mover = mover_in_residuals(samples, view, T_guess, found, s, prior)
-            if mover is not None and self._trusted(mover[1], samples, position, blind):
+            if mover is not None and self._trusted(mover[1], samples, position, blind, features):
                 found = replace(mover[1], movers=mover[0])
-        return found if found is not None and self._trusted(found, samples, position, blind) else None
+        return found if found is not None and self._trusted(found, samples, position, blind, features) else None
 
-    def _trusted(self, found: FrameRegistration, samples: Samples, position: int, blind: bool) -> bool:
+    def _trusted(
+        self,
+        found: FrameRegistration,
+        samples: Samples,
+        position: int,
+        blind: bool,
+        features: VerifiedFeatures | None = None,
+    ) -> bool:
         """Return whether a registration is reliable; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
         share = view.known_share
         agrees = found.correlation >= s.least_correlation if blind else not found.correlation < s.least_correlation
+        proven = features is not None and features.prove and features.agree_with(found.T_model_cam)
         return bool(
-            agrees
+            (agrees or proven)
             and found.overlap >= s.least_overlap * share
             and len(samples.points) * found.overlap >= 0.25 * s.least_overlap * view.valid.sum()
             and found.inliers >= s.least_inliers
@@ -385,32 +397,36 @@ class CameraTracker:
         placed: list[FrameRegistration | None] = [*found]
         for features in verified if frugal else ():
             tried.append(features)
-            placed.append(self._place(segment, position, features.T_model_cam))
+            placed.append(self._place(segment, position, features.T_model_cam, features=features))
             if self._certain(segment, placed[-1], features):
                 return placed[-1]
         left = list(verified)
         blind = self._sweep(segment, last, position) if nearby else []
-        placed += [self._place(segment, position, features.T_model_cam) for features in left]
+        placed += [self._place(segment, position, features.T_model_cam, features=features) for features in left]
         placed += [self._place(segment, position, T, blind=True) for T in blind]
-        best = max((p for p in placed if p is not None), key=_explained, default=None)
-        return best if best is not None and self._settled(segment, position, best, [*tried, *left]) else None
+        proofs = [features for features in (*tried, *left) if features.prove]
+        reliable = (p for p in placed if p is not None and (not frugal or self._settled(segment, position, p, proofs)))
+        return max(reliable, key=_explained, default=None)
 
     def _certain(self, segment: TrackedSegment, found: FrameRegistration | None, features: VerifiedFeatures) -> bool:
-        return found is not None and not self._doubtful(segment, found) and features.agree_with(found.T_model_cam)
+        if found is None or not features.agree_with(found.T_model_cam):
+            return False
+        return features.prove or not self._doubtful(segment, found)
 
     def _settled(
-        self, segment: TrackedSegment, position: int, found: FrameRegistration, verified: Sequence[VerifiedFeatures]
+        self, segment: TrackedSegment, position: int, found: FrameRegistration, proofs: Sequence[VerifiedFeatures]
     ) -> bool:
-        """Return whether features confirm a registration, or depth alone determines it and the motion is possible.
+        """Return whether features prove a registration, or else the motion is possible and either depth or colour tells.
 
-        Where depth leaves a direction free and no features tell, brightness may have slid to another minimum.
+        Where depth leaves a direction free and brightness agrees less than usual, it may have slid along.
         """
-        if verified:
-            return any(features.agree_with(found.T_model_cam) for features in verified)
+        if proofs:
+            return any(features.agree_with(found.T_model_cam) for features in proofs)
         last, far_m = max(segment.T_segment_cam), self.view(position).middle_depth
         gap_s = self.frames[position].time_s - self.frames[last].time_s
         tight = found.looseness_m(far_m, surfaces_only=True) <= self.settings.most_looseness_m
-        return tight and self._possible(segment, last, found, gap_s)
+        sure = tight or not self._doubtful(segment, found)
+        return sure and self._possible(segment, last, found, gap_s)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from the usual motions between frames of a slow video."""

@@ -26,6 +26,8 @@ class VerifiedFeatures:
     """By the new frame, in its camera, metres. Shape (N, 3)."""
     gate_m: NDArray[np.float64]
     """Largest distance between the two that noise explains. Shape (N,)."""
+    matches: int
+    """Pairs that look alike, of which these N agree on the pose."""
 
     @classmethod
     def between(
@@ -41,7 +43,12 @@ class VerifiedFeatures:
         p, q = a[both].astype(np.float64), b[both].astype(np.float64)
         gate = gates(p, q, settings, noise)
         agree = np.linalg.norm(_moved(pose.T_a_b, q) - p, axis=1) < gate
-        return cls(T_model_known @ pose.T_a_b, _moved(T_model_known, p[agree]), q[agree], gate[agree])
+        return cls(T_model_known @ pose.T_a_b, _moved(T_model_known, p[agree]), q[agree], gate[agree], len(p))
+
+    @property
+    def prove(self) -> bool:
+        """Whether most pairs agree: fewer may agree by chance, where shapes repeat."""
+        return 2 * len(self.gate_m) > self.matches
 
     def agree_with(self, T_model_cam: Pose) -> bool:
         """Return whether most of the points are where a pose (4, 4) of the new frame puts them, but for noise."""
