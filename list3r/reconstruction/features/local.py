@@ -126,8 +126,7 @@ def relative_pose(
     a, b = points_a[known].astype(np.float64), points_b[known].astype(np.float64)
     if len(a) < settings.least_pairs:
         return None
-    farther = np.maximum(a[:, 2], b[:, 2]).astype(np.float32)
-    gate = np.maximum(settings.gate_least_m, settings.gate_sigmas * noise.sigma(farther)).astype(np.float64)
+    gate = gates(a, b, settings, noise)
     triples = np.random.default_rng(len(a)).integers(0, len(a), (settings.trials, 3))
     R, t = rigid_fits(b[triples], a[triples])
     errors = np.linalg.norm(np.einsum("tij,nj->tni", R, b) + t[:, None] - a, axis=-1)
@@ -142,6 +141,14 @@ def relative_pose(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R1[0], t1[0]
     return FeaturePose(T, len(a), int(inside.sum())) if inside.sum() >= settings.least_pairs else None
+
+
+def gates(
+    a: NDArray[np.float64], b: NDArray[np.float64], settings: FeatureSettings, noise: SensorNoise
+) -> NDArray[np.float64]:
+    """Largest distances that noise explains between points in two cameras, metres. Shapes (N, 3), (N, 3) -> (N,)."""
+    farther = np.maximum(a[:, 2], b[:, 2]).astype(np.float32)
+    return np.asarray(np.maximum(settings.gate_least_m, settings.gate_sigmas * noise.sigma(farther)), np.float64)
 
 
 def rigid_fits(

@@ -208,6 +208,8 @@ class MoverMemory:
         self._settings, self._noise = settings, noise
         self.mask: Mask | None = None
         """Movers of the last tracked frame."""
+        self._continued = False
+        """Whether whole surfaces of the next view continue them."""
         self._trial: Samples | None = None
         self._trial_age = 0
         self._home = -1
@@ -220,12 +222,11 @@ class MoverMemory:
         for mask in surfaces(view, replace(self._settings, least_share=0.5 * self._settings.least_share), self._noise):
             if (mask & self.mask).sum() >= 0.5 * mask.sum():
                 out |= mask
-        if out.sum() < 0.5 * self.mask.sum():
-            out |= self.mask
-        return out
+        self._continued = bool(out.sum() >= 0.5 * self.mask.sum())
+        return out if self._continued else out | self.mask
 
     def keep(self, view: WorkingFrame, mask: Mask, T_model_cam: Pose, usual: float, home: int) -> Mask:
-        """Remember the movers of a tracked view (the whole one); returns them, or nothing once they were static.
+        """Remember the movers of a tracked view (the whole one); returns them, or nothing once they stayed in place.
 
         `usual` is the mean cost of the static part, `home` the number of the segment of the coordinates.
         """
@@ -233,9 +234,7 @@ class MoverMemory:
             self._trial, self._home = None, home
         self._trial_age += 1
         if self._trial is not None and self._trial_age >= self._settings.trial_frames:
-            again = fit(self._trial, view, mask, T_model_cam, self._settings, self._noise)
-            seen = again.count_inside >= self._settings.least_seen * len(self._trial.points)
-            if seen and again.inside < self._settings.contrast * usual:
+            if self._stayed(view, T_model_cam, usual):
                 mask = np.zeros_like(mask)
             self._trial = None
         if self._trial is None and mask.any():
@@ -244,6 +243,18 @@ class MoverMemory:
         if self.mask is None:
             self._trial = None
         return mask
+
+    def _stayed(self, view: WorkingFrame, T_model_cam: Pose, usual: float) -> bool:
+        """Return whether the movers are where they were, wherever the camera looks by now.
+
+        So they are taken to be where their place is out of sight and no surface continues them: the mask then shows
+        whatever the camera has turned to.
+        """
+        assert self._trial is not None
+        cost, _ = pixel_costs(self._trial, view, T_model_cam, self._settings, self._noise)
+        if len(cost) < self._settings.least_seen * len(self._trial.points):
+            return not self._continued
+        return _mean(cost) < self._settings.contrast * usual
 
 
 def _samples(view: WorkingFrame, mask: Mask, T_model_cam: Pose) -> Samples:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.base import Camera
 from list3r.memory.core.geometry import skew
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.poses import small_motion
@@ -126,14 +127,19 @@ class FrameRegistration:
     information: NDArray[np.float64]
     """Information on the left-hand tangent (translation, rotation) in model coordinates, without the share caused by
     noise in normals and gradients. Shape (6, 6)."""
+    information_of_surfaces: NDArray[np.float64]
+    """The share of that by depth alone."""
+    movers: NDArray[np.bool_] | None = None
+    """Part of the view that was left out, because it moves by itself. Shape (h, w)."""
 
-    def looseness_m(self, lever_m: float) -> float:
+    def looseness_m(self, lever_m: float, surfaces_only: bool = False) -> float:
         """Standard deviation of the least determined motion, metres at `lever_m` from the camera."""
+        information = self.information_of_surfaces if surfaces_only else self.information
         T = self.T_model_cam
         shift = np.eye(6)
         shift[:3, 3:] = skew(T[:3, 3])  # rotate about the camera instead of the model's origin
         scale = np.diag([1.0, 1.0, 1.0, *[1.0 / lever_m] * 3])
-        about_camera = scale @ shift.T @ self.information @ shift @ scale
+        about_camera = scale @ shift.T @ information @ shift @ scale
         weakest = float(np.linalg.eigvalsh(about_camera)[0])
         return 1.0 / float(np.sqrt(weakest)) if weakest > 0 else float("inf")
 
@@ -171,12 +177,30 @@ def register(
             break
     assert found is not None
     pairs = _SurfelPairs.of(model, *found)
-    information = _solid_information(pairs, frame, T, settings, photometric)
+    of_surfaces = _solid_information(pairs, settings)
+    information = of_surfaces
+    if photometric:
+        information = information + (
+            settings.photometric_weight * _photometric(pairs, frame, T, settings.gradient_noise)[0]
+        )
     if constraint is not None:
-        information += constraint.information(T, view.camera.fx)
+        information = information + constraint.information(T, view.camera.fx)
     return FrameRegistration(
-        T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information
+        T, pairs.overlap, pairs.share, pairs.scale, _correlation(pairs, frame), pairs.count, information, of_surfaces
     )
+
+
+def image_motion_px(
+    model: Samples, camera: Camera, T_model_a: NDArray[np.float64], T_model_b: NDArray[np.float64]
+) -> float:
+    """Return how far the model moves in the image between two poses (4, 4), px, median; inf where nothing is seen."""
+    uv, ahead = [], np.ones(len(model.points), bool)
+    for T in (T_model_a, T_model_b):
+        x, y, z = ((model.points - T[:3, 3].astype(np.float32)) @ T[:3, :3].astype(np.float32)).T
+        ahead &= z > 0.05
+        z = np.maximum(z, np.float32(0.05))
+        uv.append(np.stack([camera.fx * x / z, camera.fy * y / z], axis=1))
+    return float(np.median(np.linalg.norm(uv[0] - uv[1], axis=1)[ahead])) if ahead.any() else float("inf")
 
 
 def steps_without(
@@ -269,10 +293,8 @@ def _geometric_slope(pairs: _SurfelPairs) -> Floats:
     return plane_slopes(pairs.moved, pairs.normals, pairs.inverse_sigma)
 
 
-def _solid_information(
-    pairs: _SurfelPairs, frame: _Frame, T: NDArray[np.float64], settings: RegistrationSettings, photometric: bool
-) -> NDArray[np.float64]:
-    """Information without the share that comes from noise alone.
+def _solid_information(pairs: _SurfelPairs, settings: RegistrationSettings) -> NDArray[np.float64]:
+    """Information of depth without the share that comes from noise alone.
 
     A point-to-plane slope is A n with A = (I, [q]x). Noise of variance s in n adds s A A' on average, by which a bare
     wall would seem to constrain the camera; it is subtracted.
@@ -283,8 +305,6 @@ def _solid_information(
     feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
     information = _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, settings.huber)[0]
     information -= settings.normal_noise**2 * feigned
-    if photometric:
-        information += settings.photometric_weight * _photometric(pairs, frame, T, settings.gradient_noise)[0]
     return information
 
 

@@ -18,13 +18,20 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.frames.deferred import LazyFrame
-from list3r.reconstruction.features.local import Features, detect, match, relative_pose
+from list3r.reconstruction.features.local import Features, detect
 from list3r.reconstruction.motion.residuals import Mask, MoverMemory, fit, mover_in_residuals, without
 from list3r.reconstruction.pose_prior import given_step
 from list3r.reconstruction.poses import angle_deg, shows_more
-from list3r.reconstruction.rgbd.frame_registration import FrameRegistration, PosePrior, Samples, register
+from list3r.reconstruction.rgbd.frame_registration import (
+    FrameRegistration,
+    PosePrior,
+    Samples,
+    image_motion_px,
+    register,
+)
 from list3r.reconstruction.rgbd.settings import OdometrySettings
 from list3r.reconstruction.rgbd.surfels import SurfelModel
+from list3r.reconstruction.rgbd.verified_features import VerifiedFeatures
 from list3r.reconstruction.rgbd.view import Floats, WorkingFrame, cosines, make_view
 
 Pose = NDArray[np.float64]
@@ -87,8 +94,6 @@ class CameraTracker:
         self._prior, self._between = prior, frozenset(between)
         self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
-        steps = np.diff([frame.time_s for frame in frames])
-        self._apart = bool(len(steps) and np.median(steps) > settings.gap_s)
         self._views: dict[int, WorkingFrame] = {}
         self._mover_masks: dict[int, Mask] = {}
         self._unsure: set[int] = set()
@@ -150,9 +155,7 @@ class CameraTracker:
         if position not in self._features:
             frame = self.frames[position]
             assert frame.depth is not None
-            settings = self.settings.features
-            if self._apart:
-                settings = replace(settings, width=self.settings.feature_width)
+            settings = replace(self.settings.features, width=self.settings.feature_width)
             self._features[position] = detect(frame.color, frame.depth, self.camera, settings)
         return self._features[position]
 
@@ -220,34 +223,56 @@ class CameraTracker:
         if given is not None:
             found.append(self._place(segment, position, given.T_model_cam, prior=given))
             if self._doubtful(segment, found[0]):  # the given poses may have jumped
-                T = self._predict(segment, last, gap_s) if gap_s <= self.settings.gap_s else None
+                T = self._predict(segment, last, gap_s)
                 nearby = gap_s <= self.settings.most_gap_s
                 found.append(
                     self._search(segment, position, nearby) if T is None else self._place(segment, position, T)
                 )
-        elif gap_s <= self.settings.gap_s:
-            predicted = self._predict(segment, last, gap_s)
-            for T in (predicted, segment.T_segment_cam[last]):
-                found.append(None if T is None else self._place(segment, position, T))
-                sure = predicted is not None and not self._doubtful(segment, found[-1])
-                if sure and self._possible(segment, last, found[-1], gap_s):
-                    break
-            else:
-                found.append(self._search(segment, position, nearby=True))
+            possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
+            believed = [f for f in possible if self._believed(segment, given, f)]
+            if possible and not believed:  # the given step alone, of a frame that shows something else
+                self._unsure.add(position)  # not for the model
+            possible = believed
         else:
-            nearby = gap_s <= self.settings.most_gap_s
-            found.append(self._search(segment, position, nearby, frugal=nearby))
-        possible = [f for f in found if f is not None and self._possible(segment, last, f, gap_s)]
-        if given is not None and possible:
-            possible = [f for f in possible if self._believed(segment, given, f)]
-            if not possible:  # the given step alone, of a frame that shows something else: not for the model
-                self._unsure.add(position)
+            best = self._without_given(segment, last, position, gap_s)
+            possible = [] if best is None else [best]
         if not possible:
             return None if given is None else given.T_model_cam
         best, forget = max(possible, key=_explained), self.settings.forget
         segment.usual_inliers = max(best.inliers, forget * segment.usual_inliers)
         segment.usual_agreement = max(best.inliers * _alike(best), forget * segment.usual_agreement)
+        self._leave_out(position, best)
         return best.T_model_cam
+
+    def _leave_out(self, position: int, found: FrameRegistration) -> None:
+        """Keep the movers of the registration that was chosen; those of a false one are none."""
+        if found.movers is not None:
+            self._mover_masks[position] = self._mover_masks.get(position, np.zeros_like(found.movers)) | found.movers
+
+    def _without_given(
+        self, segment: TrackedSegment, last: int, position: int, gap_s: float
+    ) -> FrameRegistration | None:
+        """Find the frame by a start that foretells it, or else by features and starts all round.
+
+        What the pictures do decides which, never the time between them.
+        """
+        predicted = self._predict(segment, last, gap_s)
+        found: list[FrameRegistration] = []
+        for T in () if predicted is None else (predicted, segment.T_segment_cam[last]):
+            placed = self._place(segment, position, T)
+            if placed is None:
+                continue
+            sure = self._foretold(segment, T, placed) and not self._doubtful(segment, placed)
+            if sure and self._possible(segment, last, placed, gap_s):
+                return placed
+            found.append(placed)
+        nearby = gap_s <= self.settings.most_gap_s
+        return self._search(segment, position, nearby, frugal=True, found=found)
+
+    def _foretold(self, segment: TrackedSegment, T_guess: Pose, found: FrameRegistration) -> bool:
+        """Return whether a registration ended so near its start that no other minimum lies between."""
+        seen = segment.model.samples(found.T_model_cam, self.small, self.settings.sweep_samples)
+        return image_motion_px(seen, self.small, T_guess, found.T_model_cam) <= self.settings.foretold_px
 
     def _believed(self, segment: TrackedSegment, given: PosePrior, found: FrameRegistration) -> bool:
         """Return whether a pose is near the given step, or fits so well that the given poses must have jumped.
@@ -280,13 +305,13 @@ class CameraTracker:
         return PosePrior(segment.T_segment_cam[last] @ step, shift_m, turn_rad, s.prior.correlated)
 
     def _predict(self, segment: TrackedSegment, last: int, gap_s: float) -> Pose | None:
-        """Constant velocity from the last two frames; None at the beginning and after a gap, where it is not known."""
+        """Constant velocity from the last two frames; None at the beginning, where it is not known."""
         before = [p for p in segment.T_segment_cam if p < last][-1:]
         T_last = segment.T_segment_cam[last]
         if not before:
             return None
         span_s = self.frames[last].time_s - self.frames[before[0]].time_s
-        if not 0 < span_s <= self.settings.gap_s:
+        if not span_s > 0:
             return None
         step = np.linalg.inv(segment.T_segment_cam[before[0]]) @ T_last
         ratio = gap_s / span_s
@@ -302,25 +327,36 @@ class CameraTracker:
         T_guess: Pose,
         blind: bool = False,
         prior: PosePrior | None = None,
+        features: VerifiedFeatures | None = None,
     ) -> FrameRegistration | None:
-        """Register the frame to the segment's model from a guess, kept only when it is reliable."""
+        """Register the frame to the segment's model from a guess, kept only when it is reliable.
+
+        `features` that prove it stand in for the agreement of brightness, which reflections and exposure spoil.
+        """
         samples = segment.model.samples(T_guess, self.small, self.settings.samples)
         s, view = self.settings, self.view(position)
         found = register(samples, view, T_guess, s.registration, s.noise, prior)
         if found is not None and not blind:
             mover = mover_in_residuals(samples, view, T_guess, found, s, prior)
-            if mover is not None and self._trusted(mover[1], samples, position, blind):
-                self._mover_masks[position] = self._mover_masks.get(position, np.zeros_like(mover[0])) | mover[0]
-                found = mover[1]
-        return found if found is not None and self._trusted(found, samples, position, blind) else None
+            if mover is not None and self._trusted(mover[1], samples, position, blind, features):
+                found = replace(mover[1], movers=mover[0])
+        return found if found is not None and self._trusted(found, samples, position, blind, features) else None
 
-    def _trusted(self, found: FrameRegistration, samples: Samples, position: int, blind: bool) -> bool:
+    def _trusted(
+        self,
+        found: FrameRegistration,
+        samples: Samples,
+        position: int,
+        blind: bool,
+        features: VerifiedFeatures | None = None,
+    ) -> bool:
         """Return whether a registration is reliable; one from a blind guess must agree in brightness as well."""
         s, view = self.settings, self.view(position)
         share = view.known_share
         agrees = found.correlation >= s.least_correlation if blind else not found.correlation < s.least_correlation
+        proven = features is not None and features.prove and features.agree_with(found.T_model_cam)
         return bool(
-            agrees
+            (agrees or proven)
             and found.overlap >= s.least_overlap * share
             and len(samples.points) * found.overlap >= 0.25 * s.least_overlap * view.valid.sum()
             and found.inliers >= s.least_inliers
@@ -339,30 +375,58 @@ class CameraTracker:
         )
 
     def _search(
-        self, segment: TrackedSegment, position: int, nearby: bool, frugal: bool = False
+        self,
+        segment: TrackedSegment,
+        position: int,
+        nearby: bool,
+        frugal: bool = False,
+        found: Sequence[FrameRegistration] = (),
     ) -> FrameRegistration | None:
-        """Find the frame without a guess: by features, and by starts around the last pose where it is `nearby`.
+        """Find the frame by features, and by starts around the last pose where it is `nearby`.
 
-        A `frugal` search takes the first unambiguous place by features. Raises `_SkippedFramesNeededError` where frames
-        before it were skipped.
+        `found` are registrations that nothing confirms yet. A `frugal` search takes the first unambiguous place by
+        features. Raises `_SkippedFramesNeededError` where frames before it were skipped.
         """
         if self._waiting:
             raise _SkippedFramesNeededError
         last = max(segment.T_segment_cam)
-        gap_s = self.frames[position].time_s - self.frames[last].time_s
         known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
-        guesses = ((segment.T_segment_cam[k], self._feature_guess(k, position)) for k in known)
-        starts = (T_segment_known @ T for T_segment_known, T in guesses if T is not None)
-        placed: list[FrameRegistration | None] = []
-        for T in starts if frugal else ():
-            placed.append(self._place(segment, position, T))
-            if not self._doubtful(segment, placed[-1]) and self._possible(segment, last, placed[-1], gap_s):
+        guesses = (self._feature_guess(segment, k, position) for k in known)
+        verified = (features for features in guesses if features is not None)
+        tried: list[VerifiedFeatures] = []
+        placed: list[FrameRegistration | None] = [*found]
+        for features in verified if frugal else ():
+            tried.append(features)
+            placed.append(self._place(segment, position, features.T_model_cam, features=features))
+            if self._certain(segment, placed[-1], features):
                 return placed[-1]
-        left = list(starts)  # before any is placed, which removes movers from the frame
+        left = list(verified)
         blind = self._sweep(segment, last, position) if nearby else []
-        placed += [self._place(segment, position, T) for T in left]
+        placed += [self._place(segment, position, features.T_model_cam, features=features) for features in left]
         placed += [self._place(segment, position, T, blind=True) for T in blind]
-        return max((p for p in placed if p is not None), key=_explained, default=None)
+        proofs = [features for features in (*tried, *left) if features.prove]
+        reliable = (p for p in placed if p is not None and (not frugal or self._settled(segment, position, p, proofs)))
+        return max(reliable, key=_explained, default=None)
+
+    def _certain(self, segment: TrackedSegment, found: FrameRegistration | None, features: VerifiedFeatures) -> bool:
+        if found is None or not features.agree_with(found.T_model_cam):
+            return False
+        return features.prove or not self._doubtful(segment, found)
+
+    def _settled(
+        self, segment: TrackedSegment, position: int, found: FrameRegistration, proofs: Sequence[VerifiedFeatures]
+    ) -> bool:
+        """Return whether features prove a registration, or else the motion is possible and depth or colour tells it.
+
+        Where depth leaves a direction free and brightness agrees less than usual, it may have slid along.
+        """
+        if proofs:
+            return any(features.agree_with(found.T_model_cam) for features in proofs)
+        last, far_m = max(segment.T_segment_cam), self.view(position).middle_depth
+        gap_s = self.frames[position].time_s - self.frames[last].time_s
+        tight = found.looseness_m(far_m, surfaces_only=True) <= self.settings.most_looseness_m
+        sure = tight or not self._doubtful(segment, found)
+        return sure and self._possible(segment, last, found, gap_s)
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from the usual motions between frames of a slow video."""
@@ -376,13 +440,9 @@ class CameraTracker:
         ranked = sorted((f for f in found if f is not None), key=lambda f: -f.overlap * f.inliers)
         return [f.T_model_cam for f in ranked[:3]]
 
-    def _feature_guess(self, a: int, b: int) -> Pose | None:
-        fa, fb = self.features(a), self.features(b)
-        pairs = match(fa.descriptors, fb.descriptors, self.settings.features.ratio)
-        pose = relative_pose(
-            fa.points_cam[pairs[:, 0]], fb.points_cam[pairs[:, 1]], self.settings.features, self.settings.noise
-        )
-        return None if pose is None else pose.T_a_b
+    def _feature_guess(self, segment: TrackedSegment, known: int, new: int) -> VerifiedFeatures | None:
+        s, T_segment_known = self.settings, segment.T_segment_cam[known]
+        return VerifiedFeatures.between(self.features(known), T_segment_known, self.features(new), s.features, s.noise)
 
     def _join(self) -> list[TrackedSegment]:
         """Attach segments to the largest one, over and over until no more can be."""
@@ -398,6 +458,7 @@ class CameraTracker:
         for position in other.keyframes[:4]:
             found = self._search(base, position, nearby=False)
             if found is not None:
+                self._leave_out(position, found)
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
         return None
 

@@ -91,14 +91,17 @@ class OdometrySettings:
     """Decay of the usual agreement from one frame to the next that has less."""
     most_speed_m_per_s: float = 3.0
     most_turn_deg_per_s: float = 360.0
+    foretold_px: float = 2.0
+    """A registration this close to its start is the minimum that was foretold: brightness and its slope, smoothed over
+    three pixels of the working images, reach no farther. Others are verified by features."""
     gap_s: float = 0.15
-    """Frames further apart than this are searched for; their motion cannot be predicted."""
+    """Longest time over which frames are passed over."""
     most_gap_s: float = 1.5
     """Frames further apart than this are searched for by features only."""
     short_segment: int = 5
     """Frames from which on a new segment is independent."""
     feature_width: int = 448
-    """Width of the pictures whose features are compared where most frames are so far apart, px."""
+    """Width of the pictures whose features are compared, px."""
     search_keyframes: int = 6
     """Most keyframes whose features are compared in a search."""
     sweep_samples: int = 800
