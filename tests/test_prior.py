@@ -228,7 +228,7 @@ def placed(shift_m: float, inliers: float, correlation: float) -> FrameRegistrat
     """A frame found so far from its stated step, and how well it fits there."""
     T = np.eye(4)
     T[0, 3] = shift_m
-    return FrameRegistration(T, 0.9, inliers, 1.0, correlation, 5000, 1e8 * np.eye(6))
+    return FrameRegistration(T, 0.9, inliers, 1.0, correlation, 5000, 1e8 * np.eye(6), 1e8 * np.eye(6))
 
 
 @pytest.mark.parametrize(

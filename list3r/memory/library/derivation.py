@@ -146,7 +146,8 @@ def _labels(scene: Scene, members: Mapping[int, Group], known: Known) -> dict[in
     """
     labels = {n: known.labels.get(n) for n in members}
     groups, ids = list(members.values()), list(members)
-    weights = {k: scene.seen_for(k) for keys, _ in scene.constraints.labels for k in keys if k[0] in scene.rows}
+    named = {key for keys, _ in scene.constraints.labels for key in keys}
+    weights = {key: scene.seen_for(key) for group in groups for key in group if key in named}
     return labels | {ids[at]: text for at, text in scene.constraints.labels_of(groups, weights).items()}
 
 
