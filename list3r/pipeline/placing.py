@@ -88,7 +88,9 @@ def place_chunks(
         store.facts[GUESS] = guess_metre(store, main, graph.S_graph_chunk, gravity)
     S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
     store.facts.S_world_graph = S_world_graph
-    store.facts.gravity, store.facts.gravity_deviation_deg = gravity.status, gravity.deviation_deg
+    # To the digits that a deviation has: the last ones of a float64 differ from run to run.
+    deviation = None if gravity.deviation_deg is None else round(gravity.deviation_deg, 3)
+    store.facts.gravity, store.facts.gravity_deviation_deg = gravity.status, deviation
     placed = {c.chunk_id: S_world_graph @ graph.S_graph_chunk[c.chunk_id] for c in chunks}
     store.chunks.place(placed, graph.components, known)
     _place_blank(store, blank)
