@@ -36,7 +36,7 @@ def test_s_loop_weighs_frames_against_instances() -> None:
     assert loop_score(0.8, cues, 0.0) == pytest.approx(1.5)
     # frames that are the same and no instance that matches stay below the threshold
     assert loop_score(1.0, InstanceSimilarity(0.0, 0.0, (), float("nan")), 0.5) < settings.least_score
-    assert loop_score(0.95, InstanceSimilarity(0.9, 0.8, (), 0.0), 0.5) > settings.least_score
+    assert loop_score(0.95, InstanceSimilarity(0.9, 0.9, (), 0.0), 0.5) > settings.least_score
 
 
 def test_the_methods_of_association_are_stored_with_a_session() -> None:
