@@ -45,8 +45,8 @@ def memory(tmp_path: Path) -> Path:
 QUESTIONS = [
     ("info", "{}"),
     ("list", "{}"),
-    ("query", "nearest", "{}", "--point", "0,0,1"),
-    ("query", "relations", "{}"),
+    ("nearest", "{}", "--point", "0,0,1"),
+    ("relations", "{}"),
     ("verify", "{}"),
 ]
 

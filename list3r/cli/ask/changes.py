@@ -52,11 +52,11 @@ def changes(
             ]
             for c in found
         ]
-        print_table(rows, ["session", "id", "change", "what", "from", "to", "confidence", "frames", "why"])
+        print_table(rows, ["session", "id", "change", "what", "from x y z", "to x y z", "confidence", "frames", "why"])
 
 
 def _place(box: Any) -> str:
-    return "" if box is None else ", ".join(f"{v:.2f}" for v in box.center)
+    return "" if box is None else " ".join(f"{v:.2f}" for v in box.center)
 
 
 def _entry(changed: Any) -> dict[str, Any]:

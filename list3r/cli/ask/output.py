@@ -77,7 +77,8 @@ def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **
     note(*(f"note: {line}" for line in notes))
     if total is not None and total > len(matches):
         note(f"note: the best {len(matches)} of {total}; -k {total} shows all")
-    placed = any(m.distance_m is not None or m.center_distance_m is not None for m in matches)
+    to_surface = any(m.distance_m is not None for m in matches)
+    placed = to_surface or any(m.center_distance_m is not None for m in matches)
     if placed and not isinstance(units, str) and units.deviation is not None:
         note(f"note: lengths are about metres, a guess, give or take {units.deviation:.0%}")
     rows = [
@@ -85,13 +86,14 @@ def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **
             m.instance.id,
             in_column(m.instance.label or m.instance.description),
             m.score,
-            *((_length(m.distance_m), _length(m.center_distance_m)) if placed else ()),
+            *((_length(m.distance_m),) if to_surface else ()),
+            *((_length(m.center_distance_m),) if placed else ()),
             "" if m.best_view is None else m.best_view.frame_index,
             m.reason,
         ]
         for m in matches
     ]
-    distances = (f"surface ({units})", f"centre ({units})") if placed else ()
+    distances = [f"surface ({units})"] * to_surface + [f"centre ({units})"] * placed
     print_table(rows, ["id", "what", "score", *distances, "frame", "why"])
 
 

@@ -87,6 +87,7 @@ def nearest(
         many.answer(catalog, memory, lambda c, name: many.nearest(c, name, instance_id, place, words, k, chosen), json)
         return
     of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
+    of_look |= {"state": state, "component": component}
     with open_memory(memory, min_confidence, at) as scene:
         from list3r.queries.nearest import nearest as ask
 
@@ -98,7 +99,7 @@ def nearest(
             k=k,
             max_distance=max_distance,
             encoder=None if words is None else scene.word_encoder(),
-            **{**of_look, "state": state, "component": component},
+            **of_look,
         )
         print_matches(matches, scene.lengths, json)
 

@@ -51,9 +51,7 @@ def answer(url: str, memory: Path, ask: Callable[[Catalog, str | None], CatalogA
     _print(list(found), found, json, _match_row, _MATCHES)
 
 
-def answer_relations(
-    url: str, memory: Path, members: dict[str, str | None], least: float, json: bool
-) -> None:
+def answer_relations(url: str, memory: Path, members: dict[str, str | None], least: float, json: bool) -> None:
     """Ask a catalogue for relations by `subject`, `predicate` and `object`, and print them."""
     from list3r.catalog import Catalog
 
