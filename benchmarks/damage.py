@@ -134,7 +134,7 @@ def try_one(subject: Subject, kind: str, seed: str, counts: Counter[str], proble
             problems.append(f"{subject.path.stem}, {seed}: {name}: {ended} {told[:200] if ended != 'wrong' else ''}")
     if edit:
         before = run(["verify", str(subject.path), "--json"])
-        run(["label", str(subject.path), "3", "vase"])
+        run(["edit", "label", str(subject.path), "3", "vase"])
         if before and not run(["verify", str(subject.path), "--json"]) and not _is_mended(subject.path):
             problems.append(f"{subject.path.stem}, {seed}: an edit signed the damage")
         counts[f"{kind}: verify {'sound' if before == 0 else 'damaged'}"] += 1

@@ -326,7 +326,7 @@ def _underived(memory: Path) -> list[str]:
 
 
 def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
-    """Kill `list3r label`, `delete`, `merge` and `undo` at random moments: all of an edit is there or nothing."""
+    """Kill `list3r edit label`, `delete`, `merge` and `undo` at random moments: all of an edit is there or nothing."""
     rng = random.Random(seed)
     problems: list[str] = []
     counts: Counter[str] = Counter()
@@ -355,11 +355,11 @@ def kill_commands(memory: Path, kills: int, seed: int = 0) -> Result:
 def _edit_command(memory: Path, ids: list[int], known: set[int], rng: random.Random) -> list[str]:
     a, b = (str(n) for n in rng.sample(ids, 2))
     path = str(memory)
-    verbs = [["label", path, a, f"object {rng.randrange(99)}"]]
+    verbs = [["edit", "label", path, a, f"object {rng.randrange(99)}"]]
     if len(ids) > 5:
-        verbs += [["merge", path, a, b], ["delete", path, a]]
+        verbs += [["edit", "merge", path, a, b], ["edit", "delete", path, a]]
     if known:
-        verbs.append(["undo", path])
+        verbs.append(["edit", "undo", path])
     return [sys.executable, "-m", "list3r", *rng.choice(verbs)]
 
 

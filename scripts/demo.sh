@@ -25,8 +25,8 @@ run inspect "$source"
 if [ -e "$memory" ]; then again=--resume; else again=; fi
 run build "$source" -m "$memory" $again "$@"
 run list "$memory"
-run query relations "$memory" --predicate on
-run query nearest "$memory" --point 0,0,0 -k 5
+run relations "$memory" --predicate on
+run nearest "$memory" --point 0,0,0 -k 5
 for format in json usd plan glb ply tum; do
     case $format in usd) suffix=usda ;; plan) suffix=png ;; tum) suffix=txt ;; *) suffix=$format ;; esac
     run export "$memory" --to $format --out "${memory%.l3r}.$suffix"

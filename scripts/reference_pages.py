@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def command_pages() -> str:
     """Return the help of all commands as Markdown."""
-    from list3r.cli.app import GROUPS, commands
+    from list3r.cli.app import FIRST, REST, commands
 
     tree = commands()
     lines = [
@@ -23,7 +23,7 @@ def command_pages() -> str:
         "",
         "Made from the program's own help; [commands and options](../commands.md) is a summary.",
     ]
-    for title, names in GROUPS.items():
+    for title, names in (FIRST | REST).items():
         lines += ["", f"## {title}"]
         for name in names:
             command = tree.commands.get(name)

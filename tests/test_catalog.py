@@ -509,19 +509,17 @@ def test_the_commands_keep_and_ask_a_catalogue(
         assert found["schema"] == "list3r/answer/1"
         return found
 
-    for words in (("catalog", "list"), ("query", "find", "@all", "mug", "--catalog", url), ("catalog", "rebuild")):
+    for words in (("catalog", "list"), ("find", "@all", "mug", "--catalog", url), ("catalog", "rebuild")):
         assert "does not exist" in answer(*words, status=2)["error"]["message"]
     assert [e["name"] for e in answer("catalog", "add", str(tmp_path))["matches"]] == ["room"]
     ask = ("--catalog", url)
-    assert [m["id"] for m in answer("query", "find", "@all", "mug on table", *ask)["matches"]] == [3, 4]
-    assert answer("query", "nearest", "room", "--id", "3", "-k", "1", *ask)["matches"][0]["path"] == str(room)
-    assert [
-        m["id"] for m in answer("query", "within", "room", "--point", "2,1,0.4", "--radius", "0.3", *ask)["matches"]
-    ] == [5]
-    assert answer("query", "similar", "room", "--id", "3", "--everywhere", *ask)["matches"][0]["memory"] == "room"
-    assert len(answer("query", "relations", "room", "--predicate", "on", *ask)["matches"]) == 3
-    assert answer("query", "nearest", "room", "--id", "3", "--color", "red", *ask, status=2)["error"]
-    assert answer("query", "within", "@all", "--point", "0,0,0", "--radius", "1", *ask, status=2)["error"]
+    assert [m["id"] for m in answer("find", "@all", "mug on table", *ask)["matches"]] == [3, 4]
+    assert answer("nearest", "room", "3", "-k", "1", *ask)["matches"][0]["path"] == str(room)
+    assert [m["id"] for m in answer("within", "room", "--point", "2,1,0.4", "--radius", "0.3", *ask)["matches"]] == [5]
+    assert answer("similar", "room", "3", "--everywhere", *ask)["matches"][0]["memory"] == "room"
+    assert len(answer("relations", "room", "--predicate", "on", *ask)["matches"]) == 3
+    assert answer("nearest", "room", "3", "--color", "red", *ask, status=2)["error"]
+    assert answer("within", "@all", "--point", "0,0,0", "--radius", "1", *ask, status=2)["error"]
     assert answer("catalog", "check")["total"] == 0
     os.utime(room, (1, 1))
     assert answer("catalog", "check", status=1)["matches"][0]["name"] == "room"

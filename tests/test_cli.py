@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import shutil
 import sqlite3
 import subprocess
@@ -16,7 +17,7 @@ from typing import Any
 import pytest
 
 import list3r
-from list3r.cli.app import GROUPS, MODULES, commands
+from list3r.cli.app import FIRST, MODULES, REST, commands
 from list3r.exporters.registry import FORMATS
 from list3r.instances.registry import DISCOVERERS, FEATURES, TRACKERS
 from list3r.memory.core.records import Relation
@@ -24,6 +25,8 @@ from list3r.memory.store.store import Store
 from list3r.models.presets import PRESETS
 from tests.conftest import write_small_room
 from tests.program import as_user, in_process
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +63,10 @@ def one(*arguments: str | Path) -> Any:
 
 
 COMMANDS = (
-    "inspect build demo info list show export verify doctor query.nearest query.within query.relations query.similar"
-    " eval.trajectory eval.cloud eval.instances eval.revisits query.find query.seen query.path"
-    " query.changes update merges undo merge split label delete repair"
-    " embed detect scale precompute models.list models.fetch batch"
+    "inspect build demo info list show export verify doctor nearest within relations similar"
+    " eval.trajectory eval.cloud eval.instances eval.revisits find seen path changes update repair"
+    " edit.log edit.undo edit.merge edit.split edit.label edit.delete edit.scale"
+    " embed detect precompute models.list models.fetch batch"
     " catalog.add catalog.remove catalog.list catalog.check catalog.rebuild serve"
 ).split()
 
@@ -74,9 +77,55 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
     assert f"Example: list3r {command.replace('.', ' ')}" in text
 
 
-def test_every_command_stands_in_one_group_of_the_help() -> None:
-    grouped = [name for names in GROUPS.values() for name in names]
+def test_every_command_is_in_one_section_of_the_help() -> None:
+    grouped = [name for names in (FIRST | REST).values() for name in names]
     assert sorted(grouped) == sorted(name for names in MODULES.values() for name in names)
+
+
+def listed(help_text: str) -> list[str]:
+    """The commands that a page of help lists."""
+    sections = help_text.partition("Build:")[2]
+    return re.findall(r"^  (\S+)  ", sections, re.MULTILINE)
+
+
+def test_the_first_screen_of_help_has_at_most_15_commands_and_all_shows_the_rest() -> None:
+    first, everything = listed(run("--help")), listed(run("--all"))
+    assert first == [name for names in FIRST.values() for name in names]
+    assert len(first) <= 15 and {"find", "nearest", "relations", "changes", "similar"} <= set(first)
+    assert sorted(everything) == sorted(commands().commands)  # type: ignore[attr-defined]
+    assert "--all" in run("--help")
+
+
+def test_every_command_and_group_has_help() -> None:
+    paths = [[name] for name in commands().commands]  # type: ignore[attr-defined]
+    for path in paths:
+        assert f"Usage: list3r {' '.join(path)} " in run(*path, "--help")
+        if len(path) == 1:
+            paths += [[*path, name] for name in getattr(commands().commands[path[0]], "commands", {})]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")))])
+def test_every_command_line_of_the_documents_is_understood(page: str) -> None:
+    for line in command_lines((ROOT / page).read_text(encoding="utf-8")):
+        words = shlex.split(line.replace("|", "_"), comments=True)
+        words = words[: words.index(">")] if ">" in words else words
+        if any(set("[]<>") & set(word) for word in words) or "..." in line:
+            continue
+        command, path = commands(), ["list3r"]
+        while hasattr(command, "commands") and words and not words[0].startswith("-"):
+            assert words[0] in command.commands, (page, line)
+            path.append(words[0])
+            command, words = command.commands[words[0]], words[1:]
+        if words and not hasattr(command, "commands"):
+            options = [o for p in command.params for o in (*p.opts, *p.secondary_opts)]
+            asked = [word.partition("=")[0] for word in words if word.startswith("-")]
+            assert [word for word in asked if word not in (*options, "--help", "-h")] == [], (page, line)
+
+
+def command_lines(text: str) -> list[str]:
+    """What follows `list3r` in blocks and in `code`."""
+    blocks = re.findall(r"^(?:    )?(?:\$ )?list3r ([a-z-].*)$", text, re.MULTILINE)
+    return [*blocks, *re.findall(r"`list3r ([a-z-][^`]*)`", text)]
 
 
 def test_the_readme_names_every_command() -> None:
@@ -149,30 +198,30 @@ def test_the_help_shows_the_choices_there_are() -> None:
 
 
 def test_nearest_gives_surface_and_centre_distances(room: Path) -> None:
-    first, second = ask("query", "nearest", room, "--point", "1.8,0.1,0.90", "-k", "2")
+    first, second = ask("nearest", room, "--point", "1.8,0.1,0.90", "-k", "2")
     assert first["id"] == 3
     assert first["distance"] == pytest.approx(0.08, abs=0.01)
     assert first["center_distance"] == pytest.approx(0.13, abs=1e-6)
     assert second["center_distance"] > first["center_distance"]
-    assert [m["id"] for m in ask("query", "nearest", room, "--id", "3", "-k", "2")] == [2, 4]
-    assert {m["id"] for m in ask("query", "nearest", room, "mug")} == {3, 4}
-    assert ask("query", "nearest", room, "elephant") == []
-    assert ask("query", "nearest", room, "--point", "9,9,9", "--max-distance", "1") == []
+    assert [m["id"] for m in ask("nearest", room, "3", "-k", "2")] == [2, 4]
+    assert {m["id"] for m in ask("nearest", room, "--words", "mug")} == {3, 4}
+    assert ask("nearest", room, "--words", "elephant") == []
+    assert ask("nearest", room, "--point", "9,9,9", "--max-distance", "1") == []
 
 
 def test_within_relations_and_similar(room: Path) -> None:
-    assert {m["id"] for m in ask("query", "within", room, "--point", "2,0,0.77", "--radius", "0.3")} >= {3, 4}
-    assert {m["id"] for m in ask("query", "within", room, "--box", "1.7,0,0.7,1.9,0.2,0.9")} >= {3}
-    told = answer("query", "relations", room, "--predicate", "on", "--object", "2")
+    assert {m["id"] for m in ask("within", room, "--point", "2,0,0.77", "--radius", "0.3")} >= {3, 4}
+    assert {m["id"] for m in ask("within", room, "--box", "1.7,0,0.7,1.9,0.2,0.9")} >= {3}
+    told = answer("relations", room, "--predicate", "on", "--object", "2")
     assert {r["subject"] for r in told["matches"]} == {3, 4}
     assert (told["gravity"], told["state"], told["units"]) == ("estimated", "known", "m")
-    assert len(ask("query", "similar", room, "--id", "3", "-k", "2")) == 2
+    assert len(ask("similar", room, "3", "-k", "2")) == 2
     for words in (
         ("within", room, "--point", "2,0,0.77", "--radius", "0.3"),
         ("relations", room),
-        ("similar", room, "--id", "3"),
+        ("similar", room, "3"),
     ):
-        assert "mug" in run("query", *words)
+        assert "mug" in run(*words)
 
 
 @pytest.mark.parametrize("name", ["json", "csv", "plan"])

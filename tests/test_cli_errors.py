@@ -139,7 +139,7 @@ CASES = {
     "debug folder under a file": ("build {p}/good -m {p}/new.l3r --debug {p}/note.txt/x", "note.txt"),
     "unknown option": ("build {p}/good -m {p}/new.l3r --magic", "--magic"),
     "unknown command": ("magic", "magic"),
-    "question without its group": ("find {p}/room.l3r mug", "list3r query find"),
+    "edit without its group": ("label {p}/room.l3r 2 mug", "list3r edit label"),
     "no memory": ("info {p}/nothing.l3r", "does not exist"),
     "not a memory": ("info {p}/note.txt", "not a memory"),
     "another database": ("list {p}/other.db", "not a LIST3R memory"),
@@ -147,16 +147,16 @@ CASES = {
     "torn file": ("list {p}/torn.l3r", "torn.l3r"),
     "unknown id": ("show {p}/room.l3r 77", "no instance 77"),
     "id that is no number": ("show {p}/room.l3r mug", "ID.*integer"),
-    "nearest to an unknown id": ("query nearest {p}/room.l3r --id 77", "no instance 77"),
-    "nearest to nothing": ("query nearest {p}/room.l3r", "--point|--id"),
-    "nearest to half a point": ("query nearest {p}/room.l3r --point 1,2", "--point.*three numbers"),
-    "nearest to no number": ("query nearest {p}/room.l3r --point nan,0,0", "finite"),
-    "no neighbours wanted": ("query nearest {p}/room.l3r --point 0,0,0 -k 0", "k"),
-    "within no region": ("query within {p}/room.l3r", "--box.*--radius"),
-    "within a negative sphere": ("query within {p}/room.l3r --point 0,0,0 --radius=-1", "radius"),
-    "within an inverted box": ("query within {p}/room.l3r --box 1,1,1,0,0,0", "box|lower|corner"),
-    "unknown predicate": ("query relations {p}/room.l3r --predicate likes", "likes"),
-    "similar to an unknown id": ("query similar {p}/room.l3r --id 77", "no instance 77"),
+    "nearest to an unknown id": ("nearest {p}/room.l3r 77", "no instance 77"),
+    "nearest to nothing": ("nearest {p}/room.l3r", "--point"),
+    "nearest to half a point": ("nearest {p}/room.l3r --point 1,2", "--point.*three numbers"),
+    "nearest to no number": ("nearest {p}/room.l3r --point nan,0,0", "finite"),
+    "no neighbours wanted": ("nearest {p}/room.l3r --point 0,0,0 -k 0", "k"),
+    "within no region": ("within {p}/room.l3r", "--box.*--radius"),
+    "within a negative sphere": ("within {p}/room.l3r --point 0,0,0 --radius=-1", "radius"),
+    "within an inverted box": ("within {p}/room.l3r --box 1,1,1,0,0,0", "box|lower|corner"),
+    "unknown predicate": ("relations {p}/room.l3r --predicate likes", "likes"),
+    "similar to an unknown id": ("similar {p}/room.l3r 77", "no instance 77"),
     "unknown format": ("export {p}/room.l3r --to stl --out {p}/new.stl", "stl"),
     "export into no folder": ("export {p}/room.l3r --to json --out {p}/no/new.json", "no"),
     "export onto a folder": ("export {p}/room.l3r --to json --out {p}/empty", "empty"),
@@ -204,12 +204,12 @@ MORE_CASES = {
     "precompute of broken pictures": ("precompute {p}/corrupt --out {p}/broken", "5 of 6 frames cannot be used"),
     "embed of nothing": ("embed {p}/nothing.l3r", "does not exist"),
     "more sure than sure": ("list {p}/room.l3r --min-confidence 7", "--min-confidence 7"),
-    "a session of no camera": ("query seen {p}/room.l3r 3 --session 9", "--session 9 needs a camera"),
-    "a depth of no camera": ("query seen {p}/room.l3r 3 --max-depth 3", "--max-depth belongs to a camera"),
-    "a session of a box": ("query within {p}/room.l3r --box 0,0,0,1,1,1 --session 9", "--session 9 needs a camera"),
-    "who looks": ("query find {p}/room.l3r mug --from here", "viewpoint 'here'"),
+    "a session of no camera": ("seen {p}/room.l3r 3 --session 9", "--session 9 needs a camera"),
+    "a depth of no camera": ("seen {p}/room.l3r 3 --max-depth 3", "--max-depth belongs to a camera"),
+    "a session of a box": ("within {p}/room.l3r --box 0,0,0,1,1,1 --session 9", "--session 9 needs a camera"),
+    "who looks": ("find {p}/room.l3r mug --from here", "viewpoint 'here'"),
     "sizes that leave nothing": (
-        "query nearest {p}/room.l3r mug --min-size 3 --max-size 1",
+        "nearest {p}/room.l3r --words mug --min-size 3 --max-size 1",
         "min_size 3 above max_size 1",
     ),
     "repair onto itself": ("repair {p}/torn.l3r --out {p}/torn.l3r", "the damaged file itself"),
@@ -278,7 +278,7 @@ def test_a_memory_that_cannot_be_read_is_named(place: Path, tmp_path: Path) -> N
     check_refused(in_process("info", loop), "loop.l3r")
 
 
-@pytest.mark.parametrize("arguments", [(), ("query",), ("eval",)])
+@pytest.mark.parametrize("arguments", [(), ("edit",), ("eval",)])
 def test_without_a_command_the_help_is_shown(arguments: tuple[str, ...]) -> None:
     result = in_process(*arguments)
     assert "Usage: list3r" in result.stdout + result.stderr

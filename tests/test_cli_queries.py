@@ -1,4 +1,4 @@
-"""query find, seen, path, and what cameras and viewpoints answer, through the program."""
+"""find, seen, path, and what cameras and viewpoints answer, through the program."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def ask(room: Path, capsys: pytest.CaptureFixture[str]) -> Any:
-    """A function that runs `list3r query COMMAND room ...` and gives (status, standard output, standard error)."""
+    """A function that runs `list3r COMMAND room ...` and gives (status, standard output, standard error)."""
 
     def asked(command: str, *arguments: object) -> tuple[int, str, str]:
-        status = run(["query", command, str(room), *map(str, arguments)])
+        status = run([command, str(room), *map(str, arguments)])
         out = capsys.readouterr()
         return status, out.out, out.err
 
@@ -37,8 +37,8 @@ def ask(room: Path, capsys: pytest.CaptureFixture[str]) -> Any:
 
 @pytest.mark.parametrize("command", ["find", "seen", "path", "relations", "within", "nearest", "similar"])
 def test_help_has_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["query", command, "--help"]) == 0
-    assert f"Example: list3r query {command}" in capsys.readouterr().out
+    assert run([command, "--help"]) == 0
+    assert f"Example: list3r {command}" in capsys.readouterr().out
 
 
 def test_find(ask: Any) -> None:
@@ -75,7 +75,7 @@ def test_within_a_view(ask: Any) -> None:
 def test_relations_from_somewhere_and_between(ask: Any) -> None:
     found = json.loads(ask("relations", "--predicate", "left_of", "--object", TWIN, "--from", "0,0,1", "--json")[1])
     assert found["state"] == "known" and MUG in [r["subject"] for r in found["matches"]]
-    status, out, err = ask("relations", "--subject", "mug", "--from", "camera")
+    status, out, err = ask("relations", "mug", "--from", "camera")
     assert status == 0 and "left_of" in out and "as seen from frame 19" in err
     assert (
         json.loads(ask("relations", "--predicate", "between", "--object", MUG, "--and", TWIN, "--json")[1])["matches"]
@@ -118,10 +118,10 @@ def test_what_makes_no_sense_is_said_in_one_line(ask: Any, arguments: tuple[obje
 
 
 def test_words_that_nothing_bears_are_named(ask: Any) -> None:
-    for arguments in (("nearest", "zebra"), ("relations", "--subject", "zebra"), ("find", "zebra")):
+    for arguments in (("nearest", "--words", "zebra"), ("relations", "zebra"), ("find", "zebra")):
         status, out, err = ask(*arguments)
         assert status == 0 and "has the word 'zebra'" in err and "zebra" not in out
-    status, out, err = ask("nearest", "zebra", "--json")
+    status, out, err = ask("nearest", "--words", "zebra", "--json")
     told = json.loads(out)
     assert status == 0 and told["matches"] == [] and "has the word 'zebra'" in told["notes"][0] and err == ""
 
@@ -141,9 +141,22 @@ def test_with_json_an_error_is_an_answer_too(ask: Any) -> None:
 
 def test_nearest_takes_words_that_say_more_than_names(ask: Any) -> None:
     for words, wanted in (("mug on table", [MUG, TWIN]), ("4", [TWIN]), ("biggest thing", [TABLE])):
-        assert [m["id"] for m in json.loads(ask("nearest", words, "--json")[1])["matches"]] == wanted
-    near = json.loads(ask("nearest", "mug on table", "--point", "2.2,-0.1,0.8", "--json")[1])["matches"]
+        assert [m["id"] for m in json.loads(ask("nearest", "--words", words, "--json")[1])["matches"]] == wanted
+    near = json.loads(ask("nearest", "--words", "mug on table", "--point", "2.2,-0.1,0.8", "--json")[1])["matches"]
     assert [m["id"] for m in near] == [TWIN, MUG] and near[0]["distance"] < near[1]["distance"]
+
+
+def test_why_does_not_repeat_the_columns_beside_it(ask: Any) -> None:
+    for arguments, reason in ((("nearest", MUG), f"from #{MUG}"), (("similar", MUG), "cosine in test@1/16")):
+        _, table, _ = ask(*arguments)
+        matches = json.loads(ask(*arguments, "--json")[1])["matches"]
+        assert {m["reason"] for m in matches} == {reason} and table.count(reason) == len(matches)
+
+
+def test_tables_name_things_alike_and_label_places(ask: Any) -> None:
+    assert "centre x y z (m)" in ask("list")[1] and "confidence" in ask("list")[1]
+    assert "centre      x 1.80  y 0.10  z 0.77 m" in ask("show", MUG)[1]
+    assert "confidence" in ask("relations")[1].splitlines()[0]
 
 
 def test_a_box_has_six_numbers(ask: Any) -> None:

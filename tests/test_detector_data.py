@@ -59,7 +59,7 @@ def test_mugs_chairs_and_the_table_get_their_names(table: Path) -> None:
 
 def test_a_phrase_finds_both_mugs_first(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert run(["query", "find", str(table), "cup on dining table", "--json"]) == 0
+    assert run(["find", str(table), "cup on dining table", "--json"]) == 0
     answers = json.loads(capsys.readouterr().out)["matches"]
     with Store.open(table) as store:
         assert {a["id"] for a in answers[:2]} == {shown_at(store, 300, *p) for p in TRUTH["cup"]}

@@ -242,22 +242,22 @@ def test_the_face_for_python_edits_only_what_is_open_for_writing(path: Path) -> 
 
 def test_the_commands(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     name = str(path)
-    assert run(["label", name, "1", "my table", "--author", "ann"]) == 0
-    assert run(["merge", name, "2", "3", "--json"]) == 0
+    assert run(["edit", "label", name, "1", "my table", "--author", "ann"]) == 0
+    assert run(["edit", "merge", name, "2", "3", "--json"]) == 0
     assert '"kind": "merge"' in capsys.readouterr().out
-    assert run(["split", name, "4", "--out", "1:x"]) == 2
-    assert run(["delete", name, "99"]) == 2
-    assert run(["undo", name, "9999"]) == 2
+    assert run(["edit", "split", name, "4", "--out", "1:x"]) == 2
+    assert run(["edit", "delete", name, "99"]) == 2
+    assert run(["edit", "undo", name, "9999"]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 3
-    assert run(["undo", name]) == 0
+    assert run(["edit", "undo", name]) == 0
     assert "#3 is back" in capsys.readouterr().out
-    assert run(["merges", name]) == 0
+    assert run(["edit", "log", name]) == 0
     out = capsys.readouterr().out
     assert "edit merge (undone)" in out and "score" in out and "ann named" in out
-    assert run(["merges", name, "1", "--json"]) == 0
+    assert run(["edit", "log", name, "1", "--json"]) == 0
     assert '"author": "ann"' in capsys.readouterr().out
-    assert run(["split", name, "4"]) == 0
-    assert run(["delete", name, "4"]) == 0
+    assert run(["edit", "split", name, "4"]) == 0
+    assert run(["edit", "delete", name, "4"]) == 0
     assert run(["verify", name]) == 0
 
 
@@ -265,11 +265,11 @@ def test_a_file_that_another_writes_or_that_is_read_only_gives_one_line(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Store.open(path, writable=True):
-        assert run(["label", str(path), "1", "x"]) == 2
+        assert run(["edit", "label", str(path), "1", "x"]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
     if os.geteuid() != 0:
         path.chmod(0o444)
-        assert run(["label", str(path), "1", "x"]) == 2
+        assert run(["edit", "label", str(path), "1", "x"]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 

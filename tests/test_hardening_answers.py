@@ -80,7 +80,7 @@ def test_damage_refuses_what_reads_it_and_nothing_else(make_memory: Make) -> Non
 def test_damage_of_masks_is_not_an_answer(command: str, make_memory: Make, capsys: pytest.CaptureFixture[str]) -> None:
     path = make_memory()
     spoil(path, DAMAGES["masks"])
-    assert run(["query", command, str(path), "--view", "3"]) == 2
+    assert run([command, str(path), "--view", "3"]) == 2
     assert "repair" in capsys.readouterr().err
 
 

@@ -103,11 +103,11 @@ def test_an_edit_on_a_full_disk_names_the_file_and_leaves_nothing(most_bytes: in
 
     memory = make_memory()
     before = memory.read_bytes()
-    result = as_user("label", memory, "2", "mug", before=small_files)
+    result = as_user("edit", "label", memory, "2", "mug", before=small_files)
     assert result.returncode == 2 and result.stderr.count("\n") == 1, result.stderr
     assert str(memory) in result.stderr and "free some space" in result.stderr
     assert [p.name for p in memory.parent.iterdir()] == [memory.name] and memory.read_bytes() == before
-    assert run(["label", str(memory), "2", "mug"]) == 0
+    assert run(["edit", "label", str(memory), "2", "mug"]) == 0
 
 
 def test_a_new_memory_takes_no_name_but_its_own(tmp_path: Path) -> None:

@@ -30,13 +30,13 @@ COMMANDS = [
     ["info", "--loops"],
     ["merges"],
     ["verify"],
-    ["query", "find", "mug"],
-    ["query", "nearest", "--id", "3"],
-    ["query", "within", "--view", "3"],
-    ["query", "seen", "2"],
-    ["query", "relations"],
-    ["query", "path", "3", "1"],
-    ["query", "changes"],
+    ["find", "mug"],
+    ["nearest", "3"],
+    ["within", "--view", "3"],
+    ["seen", "2"],
+    ["relations"],
+    ["path", "3", "1"],
+    ["changes"],
 ]
 
 
@@ -56,7 +56,7 @@ def test_no_text_of_a_memory_reaches_the_terminal_raw(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = evil_memory(tmp_path / "evil\x1b[31m\nname.l3r")
-    place = 2 if command[0] == "query" else 1
+    place = 2 if command[0] == "edit" else 1
     run([*command[:place], str(path), *command[place:]])
     message = capsys.readouterr()
     for text in (message.out, message.err):
@@ -86,9 +86,9 @@ def program(*arguments: str | Path | bytes, **options: object) -> subprocess.Com
 
 def test_letters_that_the_terminal_lacks_are_escaped(make_memory: Make) -> None:
     path = make_memory()
-    assert run(["label", str(path), "2", "Café"]) == 0
+    assert run(["edit", "label", str(path), "2", "Café"]) == 0
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
-    for command in (["list", path], ["query", "find", path, "Café"]):
+    for command in (["list", path], ["find", path, "Café"]):
         message = program(*command, env=environment, capture_output=True)
         assert message.returncode == 0 and "Caf\\xe9" in message.stdout, message.stderr
 
@@ -100,7 +100,7 @@ def test_a_path_that_is_no_text_is_refused_in_one_line(make_memory: Make, tmp_pa
     make_memory().rename(path)
     for command in (
         ["list", path],
-        ["label", path, "2", "mug"],
+        ["edit", "label", path, "2", "mug"],
         ["verify", path],
         ["list", tmp_path / os.fsdecode(b"n\xff")],
     ):
@@ -115,7 +115,7 @@ def test_output_that_cannot_be_written_is_said_where_it_can(stream: str, state: 
     path = make_memory()
     descriptor = 1 if stream == "stdout" else 2
     where = f"{descriptor}>&-" if state == "closed" else f"{descriptor}>/dev/full"
-    command = f"{sys.executable} -m list3r label {path} 2 mug {where}"
+    command = f"{sys.executable} -m list3r edit label {path} 2 mug {where}"
     message = subprocess.run(["sh", "-c", command], text=True, capture_output=True, timeout=60, check=False)
     assert "Traceback" not in message.stderr and "Exception" not in message.stderr
     assert message.returncode == (1 if (stream, state) == ("stdout", "full") else 0)
@@ -144,7 +144,7 @@ def test_clocks_a_day_from_greenwich_are_clocks(make_memory: Make) -> None:
     """Python has no time zone of 24 hours, which systems allow."""
     path = make_memory()
     environment = {**os.environ, "TZ": "<+24>-24"}
-    for command in (["label", path, "2", "desk"], ["info", path], ["merges", path], ["query", "seen", path, "2"]):
+    for command in (["edit", "label", path, "2", "desk"], ["info", path], ["edit", "log", path], ["seen", path, "2"]):
         message = program(*command, env=environment, capture_output=True)
         assert (message.returncode, message.stderr) == (0, "")
 
@@ -162,6 +162,6 @@ def test_names_that_are_no_text_are_not_written(make_memory: Make, capsys: pytes
     with Store.open(path, writable=True) as store, pytest.raises(OptionError, match="not valid UTF-8"):
         with store.transaction():
             store.sessions.add(name, "", {}, 4)
-    assert run(["label", str(path), "2", name]) == 2 and "error: " in capsys.readouterr().err
+    assert run(["edit", "label", str(path), "2", name]) == 2 and "error: " in capsys.readouterr().err
     with Store.open(path) as store:
         assert len(store.sessions.all()) == 1 and store.verify() == []

@@ -21,7 +21,7 @@ from list3r.cli.app import run
 from list3r.exporters.prompt.cognitive_map import cognitive_maps
 from list3r.exporters.prompt.coverage import cover
 from list3r.exporters.prompt.pack import PackSettings, write_prompt
-from list3r.exporters.prompt.tokens import count_tokens
+from list3r.exporters.prompt.tokens import ENCODING, count_tokens, counted_by, estimate_tokens
 from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.store.store import Store
 from tests.conftest import instance, small_picture, write_small_room
@@ -64,15 +64,66 @@ def test_lines_count_alone_as_they_count_together(a: str, b: str) -> None:
 
 
 def test_tokens_are_counted_as_documented() -> None:
-    assert count_tokens("mug") == 1 and count_tokens("cylinder") == 2
-    assert count_tokens("185") == 3 and count_tokens(" 185") == 4
-    assert count_tokens("é") == 2 and count_tokens("a b\n") == 3
+    assert estimate_tokens("mug") == estimate_tokens(" cylinder") == 1 and estimate_tokens("refrigerator") == 2
+    assert estimate_tokens("185") == 1 and estimate_tokens(" 1850") == 3
+    assert estimate_tokens("é") == 1 and estimate_tokens("a b\n") == 3
+
+
+def test_the_estimate_is_near_what_a_real_encoding_takes(memory: SceneMemory, many: SceneMemory) -> None:
+    if counted_by() != ENCODING:
+        pytest.skip(f"tiktoken or its {ENCODING} is not cached here")
+    for text in (memory.prompt(1000).text, many.prompt(300).text, many.prompt(4000).text):
+        assert estimate_tokens(text) == pytest.approx(count_tokens(text), rel=0.1)
+
+
+def test_the_estimate_is_near_counts_that_were_taken() -> None:
+    text = "22 table | -134,-116,39 | 146x83x70@14 | on 7\n44 large brown box | 462,-90,41 | 69x43x80@11 | on 7\n"
+    assert estimate_tokens(text) == pytest.approx(48, rel=0.1)  # o200k_base
+
+
+def _mentioned(text: str) -> tuple[set[int], set[int]]:
+    """The ids that have a row, and those that a row or a list mentions."""
+    lines = text.splitlines()
+    rows = [line for line in lines if re.match(r"\d+ .* \| ", line)]
+    mentions = {int(n) for line in rows for n in re.findall(r"(?:on|in|attached to) (\d+)(?: \||$)", line)}
+    for line in lines:
+        head, _, items = line.partition(": ")
+        if head.startswith("Nearest"):
+            mentions |= {int(n) for n in re.findall(r"(?:^|; )(\d+):|(?:: |, )(\d+) ", items) for n in n if n}
+        elif head in ("Next to", "Above", "Under"):
+            mentions |= {int(n) for n in re.findall(r"\d+", items)}
+        elif head == "Changed last":
+            mentions |= {int(n) for n in re.findall(r"(?:^|; )(\d+) ", items)}
+    return {int(line.split()[0]) for line in rows}, mentions
+
+
+@pytest.mark.parametrize("tokens", range(140, 420, 20))
+def test_every_id_that_is_mentioned_has_a_row(memory: SceneMemory, many: SceneMemory, tokens: int) -> None:
+    for one, question in itertools.product((memory, many), (None, "mug", "#6")):
+        prompt = one.prompt(tokens, question)
+        rows, mentions = _mentioned(prompt.text)
+        assert rows == set(prompt.listed) and mentions <= rows
+
+
+@pytest.mark.parametrize(
+    ("question", "said"),
+    [
+        ("mug on zebra", "'zebra'"),
+        ("mug or zebra", "'zebra'"),
+        ("what is beside #999?", "#999"),
+        ("mug and #999", "#999"),
+    ],
+)
+def test_what_of_a_question_does_not_resolve_is_said(memory: SceneMemory, question: str, said: str) -> None:
+    for tokens in (150, 1000):
+        told = [line for line in memory.prompt(tokens, question).text.splitlines() if line.startswith("Question")]
+        assert len(told) == 1 and "no instance is known as" in told[0] and said in told[0]
 
 
 @pytest.mark.parametrize("tokens", [90, 150, 300, 1000, 4000])
 def test_the_text_never_takes_more_than_its_budget(many: SceneMemory, tokens: int) -> None:
     prompt = many.prompt(tokens)
-    assert prompt.tokens == count_tokens(prompt.text) <= tokens
+    assert count_tokens(prompt.text) <= prompt.tokens <= tokens
     assert prompt.instances == 300 and len(set(prompt.listed)) == len(prompt.listed)
 
 
@@ -217,7 +268,7 @@ def test_the_pack_is_whole(memory: SceneMemory, tmp_path: Path) -> None:
 
 
 def test_grids_of_many_things_hold_those_that_have_a_row(memory: SceneMemory, tmp_path: Path) -> None:
-    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90, objects_on_grids=1))
+    write_prompt(memory, tmp_path / "pack", PackSettings(tokens=90))
     maps = json.loads((tmp_path / "pack/cognitive_map.json").read_text())
     listed = json.loads((tmp_path / "pack/list3r-prompt.json").read_text())["listed"]
     things = [i.id for i in memory.instances()]

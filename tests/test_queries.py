@@ -39,7 +39,7 @@ def test_nearest_to_a_point_is_ordered_by_surfaces_and_gives_both_distances(stor
     assert np.isclose(found[0].distance_m or 0, 1.0 - 0.82, atol=0.02)
     assert np.isclose(found[0].center_distance_m or 0, 1.0 - 0.77)
     assert all(a.distance_m <= b.distance_m for a, b in pairwise(found))  # type: ignore[operator]
-    assert "surface" in found[0].reason
+    assert found[0].reason == "from the point"
 
 
 def test_nearest_agrees_with_brute_force(store: Store) -> None:

@@ -221,8 +221,9 @@ def test_path_and_seen(memory: SceneMemory, one: int, two: int, gap: float, stru
 
 
 COMMANDS = [
-    *(["query", name] for name in "find nearest within relations similar seen path changes".split()),
-    *([name] for name in "info list show merges verify".split()),
+    ["edit", "log"],
+    *([name] for name in "find nearest within relations similar seen path changes".split()),
+    *([name] for name in "info list show verify".split()),
 ]
 VALUES = st.one_of(TEXTS, NUMBERS.map(repr), IDS.map(str), POINTS.map(lambda p: ",".join(map(repr, p))))
 LINES = st.tuples(
@@ -231,7 +232,7 @@ LINES = st.tuples(
     st.lists(
         st.tuples(
             st.sampled_from(
-                "--id --point -k --radius --box --view --time --pose --session --from --subject --object --and"
+                "--words --point -k --radius --box --view --time --pose --session --from --object --and"
                 " --predicate --max-depth --max-distance --label --color --min-size --structure --no-occlusion"
                 " --max-size --min-confidence --state --component --image --since --at --json".split()
             ),

@@ -63,7 +63,7 @@ def test_colours_of_a_feature_are_its_first_numbers() -> None:
 def test_the_command_takes_a_file(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "p.png"
     cv2.imwrite(str(file), picture()[:, :, ::-1])
-    assert run(["query", "similar", str(path), "--image", str(file), "--box", "60,0,120,60", "-k", "1"]) == 0
+    assert run(["similar", str(path), "--image", str(file), "--box", "60,0,120,60", "-k", "1"]) == 0
     assert capsys.readouterr().out.splitlines()[1].startswith("4 ")
 
 
@@ -87,7 +87,7 @@ def test_what_makes_no_sense_is_one_line(
     file = tmp_path / "p.png"
     cv2.imwrite(str(file), picture()[:, :, ::-1])
     words = [a.format(path=path, file=file) for a in arguments]
-    assert run(["query", "similar", str(path), *words]) == 2
+    assert run(["similar", str(path), *words]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 

@@ -204,9 +204,9 @@ def test_a_desk_is_no_table_where_there_is_one(room: Room) -> None:
 
 def test_the_program_says_counts_and_yes_or_no(room: Room, capsys: pytest.CaptureFixture[str]) -> None:
     path = str(room[0].path)
-    assert run(["query", "find", path, "how many chairs?"]) == 0
+    assert run(["find", path, "how many chairs?"]) == 0
     assert capsys.readouterr().out.startswith("3\n")
-    assert run(["query", "find", path, "is there a dog?", "--json"]) == 0
+    assert run(["find", path, "is there a dog?", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["answer"], said["count"], said["exact"]) == ("no", None, False)
     assert {m["label"] for m in said["matches"]} == {"cat"} and said["matches"][0]["score"] < 0.7

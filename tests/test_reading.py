@@ -45,8 +45,8 @@ def memory(tmp_path: Path) -> Path:
 QUESTIONS = [
     ("info", "{}"),
     ("list", "{}"),
-    ("query", "nearest", "{}", "--point", "0,0,1"),
-    ("query", "relations", "{}"),
+    ("nearest", "{}", "--point", "0,0,1"),
+    ("relations", "{}"),
     ("verify", "{}"),
 ]
 
@@ -61,7 +61,7 @@ def test_a_question_is_answered_without_file_locks(words: tuple[str, ...], memor
 
 def test_without_file_locks_nothing_is_written(memory: Path) -> None:
     before = memory.read_bytes()
-    said = run(memory, "label", "{}", "1", "mug", before="sys.modules['fcntl'] = None")
+    said = run(memory, "edit", "label", "{}", "1", "mug", before="sys.modules['fcntl'] = None")
     assert said.returncode == 2 and "can only be read on this system" in said.stderr and said.stderr.count("\n") == 1
     assert memory.read_bytes() == before and [p.name for p in memory.parent.iterdir()] == ["m.l3r"]
 

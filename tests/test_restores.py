@@ -77,7 +77,7 @@ def test_a_restored_backup_is_shown_and_edited_without_the_log_of_a_killed_write
     with pytest.warns(MemoryFileWarning, match="the log of another file"):
         assert read_content(str(path)).instances[1].label == "saved"
 
-    changed = run("label", path, "3", "new")
+    changed = run("edit", "label", path, "3", "new")
     assert changed.returncode == 0 and f"{path.name}-wal.foreign-1" in changed.stderr
     assert Path(f"{path}-wal.foreign-1").read_bytes() == log
     assert labelled(path) == "saved"
@@ -118,7 +118,7 @@ def test_a_checkpoint_that_was_killed_is_done_again(make_memory: Make) -> None:
     assert path.stat().st_size > size
     os.truncate(path, size)  # the head of the file tells of pages that only the log has
     assert labelled(path) == f"{79:0200}"
-    assert run("label", path, "2", "last").returncode == 0
+    assert run("edit", "label", path, "2", "last").returncode == 0
     assert labelled(path) == "last"
 
 
@@ -174,7 +174,7 @@ def test_a_file_that_cannot_be_opened_keeps_what_lies_beside_it(make_memory: Mak
     edit_and_be_killed(path, "later")
     path.write_bytes(data[: len(data) // 2])
     before = {p.name: p.read_bytes() for p in path.parent.iterdir() if not p.name.endswith("-writer")}
-    assert run("label", path, "2", "x").returncode == 2
+    assert run("edit", "label", path, "2", "x").returncode == 2
     assert {p.name: p.read_bytes() for p in path.parent.iterdir() if not p.name.endswith("-writer")} == before
 
 

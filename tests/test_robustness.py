@@ -150,7 +150,7 @@ def test_a_memory_behind_a_link_is_written_there(walk: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["list", "info", "verify", "query relations"])
+@pytest.mark.parametrize("command", ["list", "info", "verify", "relations"])
 def test_output_that_nobody_reads_is_no_failure(command: str, tmp_path: Path) -> None:
     memory = write_room(tmp_path / "room.l3r")
     process = subprocess.Popen(

@@ -61,10 +61,10 @@ def test_a_memory_without_scale_says_so(memory: Path, capsys: pytest.CaptureFixt
     with open_scene(memory) as scene:
         assert scene.units == "unit" and scene.store.facts.scale_kind == "relative"
         assert not any("cm" in i.description for i in scene.instances())
-    assert run(["scale", str(memory)]) == 0 and "relative" in capsys.readouterr().out
-    assert run(["query", "nearest", str(memory), "--point", "0,0,0", "--json"]) == 0
+    assert run(["edit", "scale", str(memory)]) == 0 and "relative" in capsys.readouterr().out
+    assert run(["nearest", str(memory), "--point", "0,0,0", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["units"] == "unit"
-    assert run(["list", str(memory)]) == 0 and "center (unit)" in capsys.readouterr().out
+    assert run(["list", str(memory)]) == 0 and "centre x y z (unit)" in capsys.readouterr().out
 
 
 def test_an_anchored_thing_has_the_size_that_was_said(memory: Path, tmp_path: Path) -> None:
@@ -137,9 +137,9 @@ def test_the_height_of_the_cameras(memory: Path) -> None:
 
 def test_metric_memories_need_no_anchor(make_memory, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
     path = make_memory()
-    assert run(["scale", str(path), "--anchor", "3=1m"]) == 2
+    assert run(["edit", "scale", str(path), "--anchor", "3=1m"]) == 2
     assert "metres already" in capsys.readouterr().err
-    assert run(["scale", str(path), "--json"]) == 0
+    assert run(["edit", "scale", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["matches"][0]["scale"] == "metric"
 
 

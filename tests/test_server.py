@@ -156,6 +156,49 @@ def test_what_makes_no_sense_is_refused_in_one_line(
     assert isinstance(answer, str) and said in answer and "Traceback" not in answer
 
 
+BAD: dict[str, tuple[dict[str, Any], ...]] = {
+    "find": ({"text": "???"}, {"text": "what is beside #999?"}, {"text": "mug left of the zebra"}),
+    "nearest": ({}, {"id": 99}, {"point": [1e300, 0, 0]}, {"point": [0, 0, 0], "max_distance": -1}),
+    "within": ({}, {"center": [0, 0, 0]}, {"lower": [1, 1, 1], "upper": [0, 0, 0]}, {"center": [0] * 3, "radius": -1}),
+    "relations": (
+        {"predicate": "eats"},
+        {"predicate": "left_of"},
+        {"predicate": "between"},
+        {"predicate": "between", "object": MUG},
+        {"predicate": "on", "viewpoint": "camera"},
+        *({"predicate": "left_of", "viewpoint": v} for v in ("nowhere", "camera:999", "99")),
+    ),
+    "changes": ({"since": 99}, {"since": -1}),
+    **{name: ({"a": 98, "b": 99}, {"a": MUG, "b": MUG}) for name in ("between", "measure", "merge")},
+    **{
+        name: ({"id": 99}, {"id": 2**70}, {"id": WALL})
+        for name in ("describe", "picture", "path_of", "split", "delete")
+    },
+    "label": ({"id": 99, "text": "cup"}, {"id": MUG, "text": " "}),
+    "undo": ({"entry": 99}, {}),
+    "overview": ({},),
+}
+
+
+def test_no_answer_names_a_folder_an_option_or_a_command(tmp_path: Path) -> None:
+    path = write_room(tmp_path / "room.l3r")
+    assert set(BAD) == READING | WRITING
+
+    async def told(client: Client) -> list[str]:
+        return [str((await client.call_tool(n, words)).content) for n, each in BAD.items() for words in each]
+
+    for text in ask(path, told, write=True):
+        assert str(tmp_path) not in text and not re.search(r"(?<!\\w)--[a-z]|`list3r |Traceback", text), text
+
+
+def test_tools_have_titles_and_answer_in_compact_json(room: Path) -> None:
+    assert {t.title for t in ask(room, lambda client: client.list_tools()).tools} >= {"Overview", "Path of"}
+    answer = ask(room, lambda client: client.call_tool("describe", {"id": MUG}))
+    text = answer.content[0].text
+    assert json.loads(text) == answer.structured_content
+    assert text == json.dumps(answer.structured_content, ensure_ascii=False, separators=(",", ":"))
+
+
 def test_scene_map_and_instances_are_resources(room: Path) -> None:
     async def read(client: Client) -> tuple[Any, ...]:
         uris = ("list3r://scene", "list3r://map.png", "list3r://instance/3")
@@ -365,6 +408,7 @@ def test_a_catalogue_answers_with_the_names_of_its_memories(room: Path, tmp_path
 
         found = asyncio.run(asked())
     assert [m["name"] for m in found["memories"]["matches"]] == ["hall", "kitchen"]
+    assert str(room.parent) not in json.dumps(found)
     assert {m["memory"] for m in found["find"]["matches"]} == {"hall", "kitchen"}
     assert {m["id"] for m in found["find"]["matches"]} == {MUG, TWIN}
     assert [m["memory"] for m in found["nearest"]["matches"]] == ["hall"] * 2

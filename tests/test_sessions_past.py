@@ -128,7 +128,7 @@ def test_the_program_takes_at_on_every_query(
     name, *rest = question
     words = [rest[0]] if name == "find" else []
     options = rest[1:] if name == "find" else rest
-    assert run(["query", name, str(memory), *words, *options, "--at", "1", "--json"]) == 0
+    assert run([name, str(memory), *words, *options, "--at", "1", "--json"]) == 0
     capsys.readouterr()
-    assert run(["query", name, str(memory), *words, *options, "--at", "9"]) == 2
+    assert run([name, str(memory), *words, *options, "--at", "9"]) == 2
     assert "no session 9" in capsys.readouterr().err

@@ -104,7 +104,7 @@ def test_the_program_says_in_one_line_what_is_wrong(
 ) -> None:
     assert run(["update", str(tmp_path / "none.l3r"), str(walks[1])]) == 2
     assert run(["update", str(tmp_path / "none.l3r"), str(tmp_path / "nowhere")]) == 2
-    assert run(["query", "changes", str(tmp_path / "none.l3r")]) == 2
+    assert run(["changes", str(tmp_path / "none.l3r")]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 3
     assert all(line.startswith("error: ") for line in lines)

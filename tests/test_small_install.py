@@ -36,11 +36,11 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> str:
         ("info", "{}"),
         ("list", "{}"),
         ("show", "{}", "1"),
-        ("query", "nearest", "{}", "--point", "0,0,1"),
-        ("query", "find", "{}", "white"),
-        ("query", "relations", "{}"),
+        ("nearest", "{}", "--point", "0,0,1"),
+        ("find", "{}", "white"),
+        ("relations", "{}"),
         ("verify", "{}"),
-        ("label", "{}", "1", "mug"),
+        ("edit", "label", "{}", "1", "mug"),
     ],
 )
 def test_asking_takes_none_of_the_extras(words: tuple[str, ...], memory: str) -> None:

@@ -106,7 +106,7 @@ def test_the_program_embeds_and_answers(
     options = ["--model", "clip", "--weights", str(weights["clip"]), "--device", "cpu", "--json"]
     assert run(["embed", str(memory), *options]) == 0
     assert json.loads(capsys.readouterr().out)["matches"][0]["instances"] > 0
-    assert run(["query", "find", str(memory), "zebra", "--json"]) == 0
+    assert run(["find", str(memory), "zebra", "--json"]) == 0
     json.loads(capsys.readouterr().out)
     with list3r.open(memory) as scene:
         scene.nearest("zebra", k=2)

@@ -115,7 +115,7 @@ def test_a_chunk_without_a_usable_frame_takes_part_in_nothing(where: str, poses:
             ).returncode
             == 0
         ), kind
-    assert run("query", "nearest", memory, "1").returncode == 0
+    assert run("nearest", memory, "1").returncode == 0
     again = built(folder, memory, poses, resume=True)
     assert (again.posed, again.bad, again.chunks, again.resumed_chunks) == (left, len(gone), 3, 3)
 

@@ -270,13 +270,13 @@ def test_a_metre_is_guessed_and_says_so(memory: Path, tmp_path: Path, capsys: py
     frame = json.loads((tmp_path / "s.json").read_text())["frame"]
     assert (frame["units"], frame["metric"], frame["metric_deviation"]) == ("unit", "guessed", lengths.deviation)
     assert run(["info", str(memory)]) == 0 and "guess, give or take" in capsys.readouterr().out
-    assert run(["list", str(memory)]) == 0 and "center (about m)" in capsys.readouterr().out
-    assert run(["query", "within", str(memory), "--point", "1,1,1", "--radius", "1", "--json"]) == 0
+    assert run(["list", str(memory)]) == 0 and "centre x y z (about m)" in capsys.readouterr().out
+    assert run(["within", str(memory), "--point", "1,1,1", "--radius", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["units"], answer["metric"], answer["metre_deviation"]) == ("unit", "guessed", lengths.deviation)
-    assert run(["query", "within", str(memory), "--point", "2,2,1", "--radius", "2"]) == 0
+    assert run(["within", str(memory), "--point", "2,2,1", "--radius", "2"]) == 0
     assert "lengths are about metres" in capsys.readouterr().err
-    assert run(["scale", str(memory)]) == 0 and "about metres" in capsys.readouterr().out
+    assert run(["edit", "scale", str(memory)]) == 0 and "about metres" in capsys.readouterr().out
 
 
 def test_an_anchor_goes_before_the_guess_and_its_undo_brings_it_back(memory: Path) -> None:

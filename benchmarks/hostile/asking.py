@@ -41,18 +41,18 @@ READS = (
     "merges",
     "verify",
     "picture 2 --out OUT.jpg",
-    "query find {white box on table}",
-    "query nearest --id 3",
-    "query nearest --point 0,0,1 --state any",
-    "query within --view 3",
-    "query within --point 0,0,1 --radius 2",
-    "query seen 2",
-    "query seen --view 3",
-    "query relations --predicate on",
-    "query relations --predicate left_of --object 2 --from camera",
-    "query path 3 1",
-    "query similar --id 2",
-    "query changes --seen-again",
+    "find {white box on table}",
+    "nearest 3",
+    "nearest --point 0,0,1 --state any",
+    "within --view 3",
+    "within --point 0,0,1 --radius 2",
+    "seen 2",
+    "seen --view 3",
+    "relations --predicate on",
+    "relations --predicate left_of --object 2 --from camera",
+    "path 3 1",
+    "similar 2",
+    "changes --seen-again",
 )
 """Commands that read, and answer about a sound `subject`."""
 EDITS = ("label 2 cup", "delete 3", "merge 2 5", "undo", "split 2 --out 2:1", "delete 5")
@@ -118,7 +118,7 @@ def command_on(memory: Path, command: str, folder: Path) -> list[str]:
     words = [str(folder / w) if w.startswith("OUT") else w for w in _words(command)]
     for made in (Path(word) for word in words if word.startswith(f"{folder / 'OUT'}") and Path(word).is_dir()):
         shutil.rmtree(made)
-    place = 2 if words[0] == "query" else 1
+    place = 2 if words[0] == "edit" else 1
     return [*words[:place], str(memory), *words[place:]]
 
 

@@ -216,12 +216,12 @@ def _memory(here: Path, *statements: tuple[str, tuple[Any, ...]], command: str =
 def _track(here: Path) -> list[str]:
     """A mask track with arrays that unpack to two gigabytes."""
     blob = zipped(*((f"{k}.npy", 2**27) for k in range(16)))
-    return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="query seen", more="2")
+    return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="seen", more="2")
 
 
 def _claimed(here: Path) -> list[str]:
     blob = pack({"frames": np.zeros(2**25, np.int64)})
-    return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="query seen", more="2")
+    return _memory(here, ("UPDATE local_instances SET track = ?", (blob,)), command="seen", more="2")
 
 
 def _aliases(here: Path) -> list[str]:
@@ -250,7 +250,7 @@ def _sparse(here: Path) -> list[str]:
 def _picture(here: Path) -> list[str]:
     path = write_subject(here / "m.l3r")
     (here / "bomb.png").write_bytes(png(20_000, 20_000))
-    return ["query", "similar", str(path), "--image", str(here / "bomb.png")]
+    return ["similar", str(path), "--image", str(here / "bomb.png")]
 
 
 def _stored_picture(here: Path) -> list[str]:

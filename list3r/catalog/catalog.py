@@ -269,7 +269,7 @@ class Catalog:
         self._check_space(chosen, len(unit))
         found = self._backend.alike(None if anywhere else memory, chosen, unit, k + (instance_id is not None), filters)
         others = [(t, c) for t, c in found if (t.memory, t.id) != (memory, instance_id)][:k]
-        rows = ((t, c, None, f"cosine {c:.3f} in {chosen}") for t, c in others)
+        rows = ((t, c, None, f"cosine in {chosen}") for t, c in others)
         return self._answers(rows, [] if anywhere else entries)
 
     def relations(

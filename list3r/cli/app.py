@@ -28,55 +28,52 @@ from list3r.memory.core.errors import List3rError, MemoryFileWarning, naming_ext
 MODULES: dict[str, tuple[str, ...]] = {
     "build.commands": ("inspect", "build", "demo"),
     "build.exchange": ("convert", "import"),
+    "build.update": ("update",),
+    "build.batch": ("batch",),
     "ask.memory": ("info", "list", "show"),
-    "ask.query": ("query",),
+    "ask.query": ("find", "nearest", "relations", "similar", "within", "seen", "path"),
+    "ask.changes": ("changes",),
     "ask.picture": ("picture",),
-    "edit.commands": ("merges", "undo", "merge", "split", "label", "delete"),
-    "models.embed": ("embed",),
+    "edit.commands": ("edit",),
     "edit.export": ("export",),
     "edit.files": ("verify", "repair", "doctor"),
-    "measure.commands": ("eval",),
-    "build.update": ("update",),
-    "edit.scale": ("scale",),
+    "models.embed": ("embed",),
     "models.detect": ("detect",),
     "models.commands": ("models", "precompute"),
-    "serve.mcp": ("mcp", "ask-config"),
+    "measure.commands": ("eval",),
     "serve.view": ("view",),
-    "build.batch": ("batch",),
-    "catalog.commands": ("catalog",),
+    "serve.mcp": ("mcp", "ask-config"),
     "serve.service": ("serve",),
+    "catalog.commands": ("catalog",),
 }
 """The commands of each module of this folder; it is imported when one of them is asked for, or the help."""
-FUNCTIONS = {
-    "list": "list_instances",
-    "import": "import_map",
-    "query": "questions",
-    "eval": "measures",
-    "catalog": "catalogue",
-}
+FUNCTIONS = {"list": "list_instances", "import": "import_map", "eval": "measures", "catalog": "catalogue"}
 """Functions and groups of commands that have another name than their command."""
-GROUPS: dict[str, tuple[str, ...]] = {
-    "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
-    "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config", "serve"),
-    "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
-    "Export": ("export", "catalog"),
-    "Evaluate": ("eval",),
-    "Maintain": ("verify", "repair", "doctor", "models"),
+FIRST: dict[str, tuple[str, ...]] = {
+    "Build": ("build", "update"),
+    "Look": ("info", "list", "show", "view"),
+    "Ask": ("find", "nearest", "relations", "similar", "changes"),
+    "Change and use": ("edit", "export"),
 }
-"""Sections of the help, in order."""
+"""Sections of the first screen of the help, in order: what most people need, at most 15 commands."""
+REST: dict[str, tuple[str, ...]] = {
+    "Videos": ("demo", "inspect", "convert", "precompute", "batch"),
+    "More questions": ("within", "seen", "path", "picture"),
+    "Names and words": ("detect", "embed", "models"),
+    "Agents and other programs": ("mcp", "ask-config", "serve", "catalog", "import"),
+    "Check": ("verify", "repair", "doctor", "eval"),
+}
+"""Sections that only `list3r --all` shows."""
 
 
 class GroupedCommands(typer.core.TyperGroup):
-    """The commands in groups, each with the first sentence of its help."""
+    """The commands in sections, each with the first sentence of its help."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
-        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        for title, names in GROUPS.items():
-            rows = [(n, c.get_short_help_str(limit=300)) for n in names if (c := commands.get(n)) is not None]
-            if rows:
-                with formatter.section(title):
-                    formatter.write_dl(rows)
+        for title, names in (FIRST | REST if ctx.params.get("everything") else FIRST).items():
+            with formatter.section(title):
+                formatter.write_dl([(n, self.commands[n].get_short_help_str(limit=300)) for n in names])
 
 
 _BUILDING = ("build", "update", "demo", "precompute", "batch")
@@ -107,13 +104,14 @@ def commands(asked: str | None = None) -> Any:
     app = typer.Typer(
         name="list3r",
         cls=GroupedCommands,
-        help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example.",
+        help="Object memory for long videos: build it, ask it, export it. Every command has --help with an example; "
+        "list3r --all shows the commands that few people need.",
         no_args_is_help=True,
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback(invoke_without_command=True)(_version)
+    app.callback(invoke_without_command=True)(_options)
     one = any(asked in names for names in MODULES.values())
     for module, names in MODULES.items():
         if asked in names or not one:
@@ -131,7 +129,14 @@ def _add(app: typer.Typer, module: ModuleType, names: Iterable[str]) -> None:
             app.command(name)(found)
 
 
-def _version(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
+def _options(
+    context: typer.Context,
+    everything: bool = typer.Option(False, "--all", help="Show all commands, also those that few people need."),
+    version: bool = typer.Option(False, "--version", help="Print the version and exit."),
+) -> None:
+    if everything:
+        say(*context.get_help().splitlines())
+        raise typer.Exit
     if version:
         from list3r import __version__
 

@@ -25,6 +25,15 @@ MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memo
 AtOption = Annotated[
     int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
 ]
+LicenceOption = Annotated[
+    str,
+    typer.Option(
+        "--licence",
+        metavar="permissive|research|any",
+        help="Licences that weights may have. permissive: none that is non-commercial, gated, copyleft or custom.",
+        autocompletion=lambda: ["permissive", "research", "any"],
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on standard output.")]
 
 

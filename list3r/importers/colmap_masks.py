@@ -48,7 +48,7 @@ def read(path: Path) -> ImportedMap:
         if len(mine) >= _LEAST_POINTS:
             points = np.array([p.xyz for p in mine], np.float32)
             objects.append(ImportedObject(str(number), None, points, np.array([p.color for p in mine], np.uint8)))
-    notes = ["the model has a unit of its own: list3r scale makes it metres"]
+    notes = ["the model has a unit of its own: list3r edit scale makes it metres"]
     if unmasked:
         notes.append(f"{unmasked} of {len(found.images)} pictures have no mask")
     return ImportedMap("colmap", tuple(objects), metric=False, notes=tuple(notes))

@@ -65,7 +65,7 @@ def finish(report: R, memory: Path, source: str | Path, options: SourceOptions, 
             notes.append(anchor_scale(memory, run.scale_anchor).text)
     except List3rError as error:
         failure = error
-        notes.append(f"the scale is not anchored; `list3r scale {memory} --anchor ANCHOR` does it")
+        notes.append(f"the scale is not anchored; `list3r edit scale {memory} --anchor ANCHOR` does it")
     try:
         if run.detector is not None:
             network = load_detector(run.detector, run.detector_classes)

@@ -160,5 +160,5 @@ def _match(
         assert place is not None
         offset, reference = i.center - place, "from the point"
     center = math.sqrt(offset.dot(offset))
-    reason = f"surface {surface:.2f}, centre {center:.2f} {reference}" + (f", {named}" if named else "")
+    reason = reference + (f", {named}" if named else "")
     return Match(i, round(1.0 / (1.0 + surface), 4), surface, center, reason)

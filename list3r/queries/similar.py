@@ -58,7 +58,7 @@ def similar(
     out = []
     for other, cosine in index.search(store, query, k, passing):
         away = None if origin is None else float(np.linalg.norm(found[other].center - origin.center))
-        reason = f"cosine {cosine:.3f} in {index.space}"
+        reason = f"cosine in {index.space}"
         out.append(Match(found[other], round(cosine, 4), None, away, reason))
     return out
 
@@ -78,7 +78,7 @@ def _similar_in_part(store: Store, space: str, vector: ArrayLike, part: int, k: 
         at = order[start : start + _BATCH]
         score = dict(zip(np.concatenate(ids)[at].tolist(), np.concatenate(cosines)[at].tolist(), strict=True))
         for i in filters.select(store.instances.of(list(score))):
-            reason = f"cosine {score[i.id]:.3f} of colours alone, the first {part} numbers of {space}"
+            reason = f"cosine of colours alone, the first {part} numbers of {space}"
             out.append(Match(i, round(score[i.id], 4), None, None, reason))
         if len(out) >= k:
             break

@@ -1,4 +1,4 @@
-"""query changes: changes between sessions."""
+"""changes: changes between sessions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def changes(
 ) -> None:
     """The instances that were moved, removed or added between sessions, with frames that show it.
 
-    Example: list3r query changes house.l3r --since 1
+    Example: list3r changes house.l3r --since 1
     """
     from list3r.queries.changes import KINDS
     from list3r.queries.changes import changes as find
@@ -52,11 +52,11 @@ def changes(
             ]
             for c in found
         ]
-        print_table(rows, ["session", "id", "change", "what", "from", "to", "sure", "frames", "why"])
+        print_table(rows, ["session", "id", "change", "what", "from x y z", "to x y z", "confidence", "frames", "why"])
 
 
 def _place(box: Any) -> str:
-    return "" if box is None else ", ".join(f"{v:.2f}" for v in box.center)
+    return "" if box is None else " ".join(f"{v:.2f}" for v in box.center)
 
 
 def _entry(changed: Any) -> dict[str, Any]:

@@ -103,7 +103,9 @@ def list_instances(
         ]
         for i in kept
     ]
-    print_table(rows, ["id", "what", f"center ({units})", f"size ({units})", "conf", "seen", "kind", "state"])
+    print_table(
+        rows, ["id", "what", f"centre x y z ({units})", f"size ({units})", "confidence", "frames", "kind", "state"]
+    )
     if not rows and min_confidence is None and at is None:
         with open_memory(memory, 0.0) as scene:
             doubtful = len(scene.instances(structure=False))
@@ -119,6 +121,10 @@ def _give_or_take(sigma: float | None, units: Lengths | str) -> str:
 
 def _triple(values: Any) -> str:
     return " ".join(f"{v:6.2f}" for v in values)
+
+
+def _place(values: Any) -> str:
+    return "  ".join(f"{axis} {v:.2f}" for axis, v in zip("xyz", values, strict=True))
 
 
 def show(
@@ -155,7 +161,7 @@ def show(
     count = len({part["chunk"] for part in parts})
     chunks = "1 chunk" if count == 1 else f"{count} chunks"
     for key, value in (
-        ("center", f"{_triple(instance.center)} {units}{_give_or_take(instance.position_sigma_m, units)}"),
+        ("centre", f"{_place(instance.center)} {units}{_give_or_take(instance.position_sigma_m, units)}"),
         ("size", f"{_triple(instance.box.size)} {units}"),
         ("confidence", f"{instance.confidence:.2f}, seen in {instance.observations} frames of {chunks}"),
         *(() if instance.label is None else (("named by", _named_by(instance, named)),)),
@@ -188,8 +194,8 @@ def _track_lines(times_s: Any, places: Any, units: Lengths | str) -> list[tuple[
     way = sum(math.dist(a, b) for a, b in itertools.pairwise(places.tolist()))
     return [
         ("moved", f"{times_s[0]:.2f} s to {times_s[-1]:.2f} s, {way:.2f} {units} in {len(times_s)} frames"),
-        ("from", f"{_triple(places[0])} {units}"),
-        ("to", f"{_triple(places[-1])} {units}"),
+        ("from", f"{_place(places[0])} {units}"),
+        ("to", f"{_place(places[-1])} {units}"),
     ]
 
 

@@ -1,11 +1,9 @@
-"""Options and output of the query commands."""
+"""What the questions print, and the camera that their options name."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask.memory import instance_dict
@@ -16,60 +14,24 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from list3r.api import SceneMemory
-    from list3r.cli.ask.arguments import CameraArguments
     from list3r.memory.core.records import BestView, Relation
     from list3r.memory.library.world.scale import Lengths
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
     from list3r.queries.views.camera import PosedCamera
 
-Count = Annotated[int, typer.Option("-k", help="Most answers to return.")]
-MinConfidence = Annotated[
-    float | None,
-    typer.Option(
-        "--min-confidence",
-        help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
-    ),
-]
-Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
-Label = Annotated[
-    str | None,
-    typer.Option("--label", metavar="WORDS", help="Only instances with one of these words in label or description."),
-]
-Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only instances of this colour.")]
-MinSize = Annotated[float | None, typer.Option("--min-size", help="Only instances with at least this longest edge.")]
-MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only instances with at most this longest edge.")]
-State = Annotated[
-    str | None,
-    typer.Option(
-        "--state",
-        metavar="present|moved|removed|added|unseen|any",
-        help="Only instances in this state; default: all but removed.",
-    ),
-]
-Component = Annotated[int | None, typer.Option("--component", help="Only this connected component.")]
-View = Annotated[
-    int | None, typer.Option("--view", metavar="FRAME", help="Only instances that the camera of this frame sees.")
-]
-Time = Annotated[
-    float | None,
-    typer.Option("--time", metavar="S", help="The camera of the posed frame nearest to this time, seconds."),
-]
-Pose = Annotated[
-    str | None,
-    typer.Option(
-        "--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera at this position with this rotation (OpenCV axes)."
-    ),
-]
-SessionOption = Annotated[int | None, typer.Option("--session", help="The session of the frame or camera.")]
-MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="How far the camera sees.")]
 
-
-def camera_from(scene: SceneMemory, given: CameraArguments) -> PosedCamera | None:
+def camera_from(
+    scene: SceneMemory,
+    *,
+    view: int | None = None,
+    time: float | None = None,
+    pose: str | None = None,
+    session: int | None = None,
+) -> PosedCamera | None:
     """The camera that the options name; None for none of them. Raises `OptionError`."""
     from list3r.memory.core.errors import OptionError
 
-    view, time, pose, session = given.view, given.time, given.pose, given.session
     if sum(option is not None for option in (view, time, pose)) > 1:
         raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
     if view is None and time is None and pose is None:
@@ -115,7 +77,8 @@ def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **
     note(*(f"note: {line}" for line in notes))
     if total is not None and total > len(matches):
         note(f"note: the best {len(matches)} of {total}; -k {total} shows all")
-    placed = any(m.distance_m is not None or m.center_distance_m is not None for m in matches)
+    to_surface = any(m.distance_m is not None for m in matches)
+    placed = to_surface or any(m.center_distance_m is not None for m in matches)
     if placed and not isinstance(units, str) and units.deviation is not None:
         note(f"note: lengths are about metres, a guess, give or take {units.deviation:.0%}")
     rows = [
@@ -123,13 +86,14 @@ def print_matches(matches: Sequence[Match], units: Lengths | str, json: bool, **
             m.instance.id,
             in_column(m.instance.label or m.instance.description),
             m.score,
-            *((_length(m.distance_m), _length(m.center_distance_m)) if placed else ()),
+            *((_length(m.distance_m),) if to_surface else ()),
+            *((_length(m.center_distance_m),) if placed else ()),
             "" if m.best_view is None else m.best_view.frame_index,
             m.reason,
         ]
         for m in matches
     ]
-    distances = (f"surface ({units})", f"centre ({units})") if placed else ()
+    distances = [f"surface ({units})"] * to_surface + [f"centre ({units})"] * placed
     print_table(rows, ["id", "what", "score", *distances, "frame", "why"])
 
 
@@ -147,7 +111,7 @@ def print_relations(scene: SceneMemory, found: Relations, json: bool) -> None:
     rows = [
         [r.subject, names[r.subject], r.predicate, r.object, _object(r, names), r.confidence, r.margin] for r in found
     ]
-    print_table(rows, ["id", "subject", "predicate", "id", "object", "conf", f"margin ({units})"])
+    print_table(rows, ["id", "subject", "predicate", "id", "object", "confidence", f"margin ({units})"])
     if found.reason:
         note(f"note: {found.reason}")
 

@@ -1,115 +1,21 @@
-"""query nearest, within, relations, similar, find, seen, path, changes."""
+"""find, nearest, relations, similar, within, seen, path: questions to a memory."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.ask.arguments import (
-    OF_APPEARANCE,
-    CameraArguments,
-    FilterArguments,
-    NearArguments,
-    RegionArguments,
-    RelationArguments,
-    SimilarArguments,
-)
-from list3r.cli.ask.changes import changes
-from list3r.cli.ask.output import Count, Structure, camera_from, print_matches, print_relations
-from list3r.cli.catalog.questions import with_catalog
-from list3r.cli.common import AtOption, JsonOption, MemoryArgument, only, open_memory, print_table, spread
+from list3r.cli.ask import options as opt
+from list3r.cli.ask.output import camera_from, print_matches, print_relations
+from list3r.cli.catalog import questions as many
+from list3r.cli.common import AtOption, JsonOption, MemoryArgument, open_memory, parse_point, print_table
 from list3r.cli.terminal import note, say
 
-
-def nearest(
-    memory: MemoryArgument,
-    near: NearArguments,
-    *,
-    k: Count = 5,
-    filters: FilterArguments,
-    json: JsonOption = False,
-    at: AtOption = None,
-) -> None:
-    """The instances nearest to a point or an instance, with distances of surfaces and of centres.
-
-    Example: list3r query nearest house.l3r mug --point 0.5,1.2,0.8 -k 3
-    """
-    origin = near.origin()
-    with open_memory(memory, filters.min_confidence, at) as scene:
-        from list3r.queries.nearest import nearest as ask
-
-        matches = ask(
-            scene.store,
-            words=near.words,
-            point=origin,
-            instance_id=near.id,
-            k=k,
-            max_distance=near.max_distance,
-            encoder=None if near.words is None else scene.word_encoder(),
-            **filters.options(),
-        )
-        print_matches(matches, scene.lengths, json)
-
-
-def within(
-    memory: MemoryArgument,
-    region: RegionArguments,
-    camera: Annotated[CameraArguments, only("view", "pose", "session", "max_depth")],
-    *,
-    occlusion: Annotated[bool, typer.Option(help="Leave out instances that others hide from the camera.")] = True,
-    filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
-    json: JsonOption = False,
-    at: AtOption = None,
-) -> None:
-    """The instances inside a box or a sphere, or those that a camera sees.
-
-    Example: list3r query within house.l3r --point 0,0,1 --radius 0.5
-    """
-    lengths: dict[str, Any] = region.lengths(camera)
-    with open_memory(memory, filters.min_confidence, at) as scene:
-        seen_by = camera_from(scene, camera)
-        found = scene.within(
-            **lengths, camera=seen_by, max_depth=camera.max_depth, occlusion=occlusion, **filters.options()
-        )
-        print_matches(found, scene.lengths, json, total=len(found))
-
-
-def relations(memory: MemoryArgument, asked: RelationArguments, json: JsonOption = False, at: AtOption = None) -> None:
-    """The relations between instances, by subject, predicate and object.
-
-    Example: list3r query relations house.l3r --predicate left_of --object 4 --from camera
-    """
-    with open_memory(memory, at=at) as scene:
-        print_relations(scene, scene.relations(**asdict(asked)), json)
-
-
-def similar(
-    memory: MemoryArgument,
-    like: SimilarArguments,
-    *,
-    k: Count = 5,
-    filters: Annotated[FilterArguments, only(*OF_APPEARANCE)],
-    json: JsonOption = False,
-    at: AtOption = None,
-) -> None:
-    """The instances most similar in appearance to one instance or to a picture.
-
-    Example: list3r query similar house.l3r --image mug.jpg --box 120,80,180,150
-    """
-    from list3r.memory.core.errors import OptionError
-
-    with open_memory(memory, filters.min_confidence, at) as scene:
-        if (like.id is None) == (like.image is None) or (like.box is not None and like.image is None):
-            raise OptionError("give a query: --id ID, or --image FILE, with --box for a part of it")
-        if like.image is not None:
-            found = scene.similar_to_picture(like.image, k, box_xyxy=like.corners(), **filters.options())
-        else:
-            assert like.id is not None
-            found = scene.similar(like.id, k=k, **filters.options())
-        print_matches(found, scene.lengths, json)
+if TYPE_CHECKING:
+    from list3r.queries.match import FilterOptions
 
 
 def find(
@@ -118,18 +24,23 @@ def find(
         str,
         typer.Argument(metavar="TEXT", help="Question or description, such as: where is the lamp?", show_default=False),
     ],
-    k: Count = 5,
+    k: opt.Count = 5,
     viewpoint: Annotated[
         str | None,
         typer.Option("--from", metavar="ID|camera|X,Y,Z", help="Viewpoint of left, right, in front of and behind."),
     ] = None,
-    json: JsonOption = False,
+    catalog: opt.Catalogue = None,
     at: AtOption = None,
+    json: JsonOption = False,
 ) -> None:
     """The instances that a question is about, how many, or yes or no; an id can replace words.
 
-    Example: list3r query find house.l3r "how many chairs are next to the table?"
+    Example: list3r find house.l3r "how many chairs are next to the table?"
     """
+    if catalog is not None:
+        many.refuse({"--from": viewpoint, "--at": at})
+        many.answer(catalog, memory, lambda c, name: c.find(text, name, k=k, filters=many.filters()), json)
+        return
     with open_memory(memory, at=at) as scene:
         found, units = scene.find(text, k, viewpoint=viewpoint), scene.lengths
     if not json and (found.counted is not None or found.answer is not None):
@@ -137,28 +48,235 @@ def find(
     print_matches(found, units, json, **found.facts())
 
 
+def nearest(
+    memory: MemoryArgument,
+    instance_id: opt.OptionalId = None,
+    point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None,
+    words: Annotated[
+        str | None, typer.Option("--words", metavar="WORDS", help="Only instances that these words name, as in find.")
+    ] = None,
+    k: opt.Count = 5,
+    max_distance: Annotated[
+        float | None, typer.Option("--max-distance", help="Only instances whose surface is at most this far away.")
+    ] = None,
+    label: opt.Label = None,
+    color: opt.Color = None,
+    min_size: opt.MinSize = None,
+    max_size: opt.MaxSize = None,
+    min_confidence: opt.MinConfidence = None,
+    state: opt.State = None,
+    component: opt.Component = None,
+    structure: opt.Structure = False,
+    catalog: opt.Catalogue = None,
+    at: AtOption = None,
+    json: JsonOption = False,
+) -> None:
+    """The instances nearest to an instance or a point, with distances of surfaces and of centres.
+
+    Example: list3r nearest house.l3r 12 -k 3
+    """
+    from list3r.memory.core.errors import OptionError
+
+    if words is None and point is None and instance_id is None:
+        raise OptionError("give a place: an ID, --point x,y,z, or --words such as mug")
+    place = None if point is None else parse_point(point, "--point")
+    if catalog is not None:
+        many.refuse({"--max-distance": max_distance, "--component": component, "--at": at})
+        many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size})
+        chosen = many.filters(min_confidence, structure=structure, state=state)
+        many.answer(catalog, memory, lambda c, name: many.nearest(c, name, instance_id, place, words, k, chosen), json)
+        return
+    of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
+    of_look |= {"state": state, "component": component}
+    with open_memory(memory, min_confidence, at) as scene:
+        from list3r.queries.nearest import nearest as ask
+
+        matches = ask(
+            scene.store,
+            words=words,
+            point=place,
+            instance_id=instance_id,
+            k=k,
+            max_distance=max_distance,
+            encoder=None if words is None else scene.word_encoder(),
+            **of_look,
+        )
+        print_matches(matches, scene.lengths, json)
+
+
+def within(
+    memory: MemoryArgument,
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X,Y,Z,X,Y,Z", help="Lower and upper corner of a box.")
+    ] = None,
+    point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Centre of a sphere.")] = None,
+    radius: Annotated[float | None, typer.Option("--radius", help="Radius of the sphere.")] = None,
+    view: opt.View = None,
+    pose: opt.Pose = None,
+    session: opt.Session = None,
+    max_depth: opt.MaxDepth = None,
+    occlusion: Annotated[bool, typer.Option(help="Leave out instances that others hide from the camera.")] = True,
+    label: opt.Label = None,
+    color: opt.Color = None,
+    min_size: opt.MinSize = None,
+    max_size: opt.MaxSize = None,
+    min_confidence: opt.MinConfidence = None,
+    structure: opt.Structure = False,
+    catalog: opt.Catalogue = None,
+    at: AtOption = None,
+    json: JsonOption = False,
+) -> None:
+    """The instances inside a box or a sphere, or those that a camera sees.
+
+    Example: list3r within house.l3r --point 0,0,1 --radius 0.5
+    """
+    region: dict[str, Any] = opt.region(box, point, radius, camera=view is not None or pose is not None)
+    if catalog is not None:
+        many.refuse({"--view": view, "--pose": pose, "--session": session, "--max-depth": max_depth, "--at": at})
+        many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size})
+        many.refuse({"--no-occlusion": not occlusion})
+        chosen = many.filters(min_confidence, structure=structure)
+        many.answer(catalog, memory, lambda c, name: c.within(many.one(name), **region, filters=chosen), json)
+        return
+    of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
+    with open_memory(memory, min_confidence, at) as scene:
+        camera = camera_from(scene, view=view, pose=pose, session=session)
+        found = scene.within(**region, camera=camera, max_depth=max_depth, occlusion=occlusion, **of_look)
+        print_matches(found, scene.lengths, json, total=len(found))
+
+
+def relations(
+    memory: MemoryArgument,
+    subject: Annotated[
+        str | None,
+        typer.Argument(metavar="[ID|WORDS]", help="First member of the relation: an id or words.", show_default=False),
+    ] = None,
+    predicate: Annotated[
+        str | None,
+        typer.Option(
+            "--predicate",
+            metavar="PREDICATE",
+            help="on, supports, in, contains, above, below, under, next_to, near, attached_to, between; seen "
+            "from --from: left_of, right_of, in_front_of, behind.",
+        ),
+    ] = None,
+    object: Annotated[
+        str | None, typer.Option("--object", metavar="ID|WORDS", help="Second member of the relation.")
+    ] = None,
+    other: Annotated[
+        str | None, typer.Option("--and", metavar="ID|WORDS", help="For between: the other of the two instances.")
+    ] = None,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="ID|camera|X,Y,Z",
+            help="Viewpoint of left_of, right_of, in_front_of and behind: the centre of an instance, the last place of "
+            "the camera (camera), its place in a frame (camera:FRAME), or a point. The view is towards the middle of "
+            "the two instances.",
+        ),
+    ] = None,
+    min_confidence: Annotated[
+        float, typer.Option("--min-confidence", help="Only relations with at least this confidence.")
+    ] = 0.0,
+    catalog: opt.Catalogue = None,
+    at: AtOption = None,
+    json: JsonOption = False,
+) -> None:
+    """The relations between instances, by subject, predicate and object.
+
+    Example: list3r relations house.l3r mug --predicate on --object table
+    """
+    if catalog is not None:
+        many.refuse({"--and": other, "--from": viewpoint, "--at": at})
+        members = {"subject": subject, "predicate": predicate, "object": object}
+        many.answer_relations(catalog, memory, members, min_confidence, json)
+        return
+    with open_memory(memory, at=at) as scene:
+        found = scene.relations(
+            subject=subject,
+            predicate=predicate,
+            object=object,
+            other=other,
+            viewpoint=viewpoint,
+            min_confidence=min_confidence,
+        )
+        print_relations(scene, found, json)
+
+
+def similar(
+    memory: MemoryArgument,
+    instance_id: opt.OptionalId = None,
+    image: Annotated[Path | None, typer.Option("--image", metavar="FILE", help="Compare with this picture.")] = None,
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only the part of the picture in this box, px.")
+    ] = None,
+    k: opt.Count = 5,
+    label: opt.Label = None,
+    color: opt.Color = None,
+    min_size: opt.MinSize = None,
+    max_size: opt.MaxSize = None,
+    min_confidence: opt.MinConfidence = None,
+    structure: opt.Structure = False,
+    catalog: opt.Catalogue = None,
+    everywhere: Annotated[
+        bool, typer.Option("--everywhere", help="With --catalog: compare with the instances of all memories.")
+    ] = False,
+    at: AtOption = None,
+    json: JsonOption = False,
+) -> None:
+    """The instances most similar in appearance to one instance or to a picture.
+
+    Example: list3r similar house.l3r --image mug.jpg --box 120,80,180,150
+    """
+    from list3r.memory.core.errors import OptionError
+
+    corners = opt.corners(box)
+    if catalog is not None:
+        many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size, "--at": at})
+        chosen, like = many.filters(min_confidence, structure=structure), (instance_id, image, corners)
+        many.answer(catalog, memory, lambda c, name: many.similar(c, name, like, k, chosen, everywhere), json)
+        return
+    if everywhere:
+        raise OptionError("--everywhere needs --catalog URL")
+    if (instance_id is None) == (image is None) or (box is not None and image is None):
+        raise OptionError("give a query: an ID, or --image FILE, with --box for a part of it")
+    of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
+    with open_memory(memory, min_confidence, at) as scene:
+        if image is not None:
+            found = scene.similar_to_picture(image, k, box_xyxy=corners, **of_look)
+        else:
+            assert instance_id is not None
+            found = scene.similar(instance_id, k=k, **of_look)
+        print_matches(found, scene.lengths, json)
+
+
 def seen(
     memory: MemoryArgument,
-    options: CameraArguments,
     instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
-    structure: Structure = False,
-    json: JsonOption = False,
+    time: opt.Time = None,
+    view: opt.View = None,
+    pose: opt.Pose = None,
+    session: opt.Session = None,
+    max_depth: opt.MaxDepth = None,
+    structure: opt.Structure = False,
     at: AtOption = None,
+    json: JsonOption = False,
 ) -> None:
     """When an instance was seen, or what was visible at a time, in a frame, or from a pose.
 
-    Example: list3r query seen house.l3r --time 12.5
+    Example: list3r seen house.l3r --time 12.5
     """
     from list3r.memory.core.errors import OptionError
 
     with open_memory(memory, at=at) as scene:
-        camera = camera_from(scene, options)
+        camera = camera_from(scene, view=view, time=time, pose=pose, session=session)
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
-        if camera is None and options.max_depth is not None:
+        if camera is None and max_depth is not None:
             raise OptionError("--max-depth belongs to a camera; leave it out for an instance")
         if camera is not None:
-            found = scene.visible(camera, max_depth=options.max_depth, structure=structure)
+            found = scene.visible(camera, max_depth=max_depth, structure=structure)
             if camera.frame is not None and not json:
                 note(f"frame {camera.frame.frame_index} of session {camera.session_id}, {camera.frame.time_s:.2f} s")
             print_matches(found, scene.lengths, json, total=len(found))
@@ -197,24 +315,32 @@ def path(
     start: Annotated[int, typer.Argument(metavar="ID", help="First instance.", show_default=False)],
     end: Annotated[int, typer.Argument(metavar="ID", help="Second instance.", show_default=False)],
     structure: Annotated[bool, typer.Option(help="Allow paths over floor and walls.")] = True,
-    json: JsonOption = False,
     at: AtOption = None,
+    json: JsonOption = False,
 ) -> None:
     """The shortest chain of relations from one instance to another.
 
-    Example: list3r query path house.l3r 12 4
+    Example: list3r path house.l3r 12 4
     """
     with open_memory(memory, at=at) as scene:
         found = scene.path_between(start, end, structure=structure)
         print_relations(scene, found, json)
 
 
-questions = typer.Typer(
-    help="Find instances that are near, inside, visible, similar, related, described by words, or changed.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-for command in (nearest, within, relations, similar, find):
-    questions.command(command.__name__)(with_catalog(spread(command)))
-for other in (seen, path, changes):
-    questions.command(other.__name__)(spread(other))
+def _filters(
+    label: str | None,
+    color: str | None,
+    min_size: float | None,
+    max_size: float | None,
+    min_confidence: float | None,
+    structure: bool,
+) -> FilterOptions:
+    """Return the filters as the questions of Python take them."""
+    return {
+        "label": label,
+        "color": color,
+        "min_size": min_size,
+        "max_size": max_size,
+        "min_confidence": min_confidence or 0.0,
+        "structure": structure,
+    }

@@ -86,14 +86,14 @@ def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
     objects = scene.instances()
     names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
     say("", f"3. list3r list {memory}")
-    print_table([[i.id, names[i.id], i.confidence] for i in objects], ["id", "what", "conf"])
-    say("", f"4. list3r query relations {memory} --predicate on")
+    print_table([[i.id, names[i.id], i.confidence] for i in objects], ["id", "what", "confidence"])
+    say("", f"4. list3r relations {memory} --predicate on")
     rows = [[names[r.subject], "on", names[r.object], r.confidence] for r in scene.relations(predicate="on")]
-    print_table(rows, ["subject", "", "object", "conf"])
+    print_table(rows, ["subject", "", "object", "confidence"])
     if not objects:
         return
     first = min(objects, key=lambda i: float(i.box.size.prod()))
-    say("", f"5. list3r query nearest {memory} --id {first.id} -k 3        (nearest to the {names[first.id]})")
+    say("", f"5. list3r nearest {memory} {first.id} -k 3        (nearest to the {names[first.id]})")
     matches = scene.nearest(first.id, k=3)
     print_table([[m.instance.id, names[m.instance.id], m.distance_m] for m in matches], ["id", "what", "surface (m)"])
 

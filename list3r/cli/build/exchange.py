@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,24 +17,6 @@ if TYPE_CHECKING:
     from list3r.reconstruction.outputs.base import OutputOptions
 
 
-@dataclass(frozen=True)
-class PredictionArguments:
-    """Options that describe the predictions of a network."""
-
-    frame_size: Annotated[
-        str | None,
-        typer.Option(
-            "--frame-size",
-            metavar="WxH",
-            help="For predictions: size of the video's frames, if the network cropped them.",
-        ),
-    ] = None
-    masks: Annotated[
-        Path | None,
-        typer.Option("--masks", metavar="DIR", help="For predictions: folder of masks that EntitySAM saved."),
-    ] = None
-
-
 @spread
 def convert(
     source: src.SourceArgument,
@@ -49,7 +30,18 @@ def convert(
             help="tum, transforms, colmap, replica or r3d; for predictions of networks: precomputed.",
         ),
     ],
-    predictions: PredictionArguments,
+    frame_size: Annotated[
+        str | None,
+        typer.Option(
+            "--frame-size",
+            metavar="WxH",
+            help="For predictions: size of the video's frames, if the network cropped them.",
+        ),
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option("--masks", metavar="DIR", help="For predictions: folder of masks that EntitySAM saved."),
+    ] = None,
     given: src.SourceArguments,
     json: JsonOption = False,
 ) -> None:
@@ -60,8 +52,7 @@ def convert(
     if to == "precomputed":
         from list3r.reconstruction.outputs.base import OutputOptions
 
-        size = predictions.frame_size
-        options = OutputOptions(given.every, None if size is None else read_size(size), predictions.masks)
+        options = OutputOptions(given.every, None if frame_size is None else read_size(frame_size), masks)
         _convert_predictions(Path(source), folder, options, json)
         return
     from list3r.frames.convert import convert as write

@@ -1,4 +1,4 @@
-"""merges, undo, merge, split, label, delete: corrections by an operator."""
+"""edit label, merge, split, delete, scale, undo, log: corrections by an operator."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IdArgument = Annotated[
 AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Author of the edit; default: you.")]
 
 
-def merges(
+def log(
     memory: MemoryArgument,
     instance_id: Annotated[
         int | None, typer.Argument(metavar="[ID]", help="Only entries about this instance.", show_default=False)
@@ -31,7 +31,7 @@ def merges(
 ) -> None:
     """Show the merge log: every decision with its numbers, every edit with its author.
 
-    Example: list3r merges house.l3r 12
+    Example: list3r edit log house.l3r 12
     """
     from list3r.memory.library.maintenance.merge_log import states
 
@@ -68,7 +68,7 @@ def undo(
     entry: Annotated[
         int | None,
         typer.Argument(
-            metavar="[ENTRY]", help="An entry of `list3r merges`; without it, the last edit.", show_default=False
+            metavar="[ENTRY]", help="An entry of `list3r edit log`; without it, the last edit.", show_default=False
         ),
     ] = None,
     author: AuthorOption = None,
@@ -76,7 +76,7 @@ def undo(
 ) -> None:
     """Undo an edit or a merge decision; ids that were retired come back.
 
-    Example: list3r undo house.l3r 41
+    Example: list3r edit undo house.l3r 41
     """
     _run_edit(memory, lambda scene: scene.undo(entry, author=author), json)
 
@@ -90,7 +90,7 @@ def merge(
 ) -> None:
     """Merge two instances that are one instance: the older id stays, and the other resolves to it from then on.
 
-    Example: list3r merge house.l3r 12 31
+    Example: list3r edit merge house.l3r 12 31
     """
     _run_edit(memory, lambda scene: scene.merge(a, b, author=author), json)
 
@@ -112,7 +112,7 @@ def split(
 ) -> None:
     """Split an instance that is two instances: the larger part keeps the id.
 
-    Example: list3r split house.l3r 12 --out 3:4,5:2
+    Example: list3r edit split house.l3r 12 --out 3:4,5:2
     """
     parts = None if out is None else _parse_parts(out)
     _run_edit(memory, lambda scene: scene.split(instance_id, parts, author=author), json)
@@ -127,7 +127,7 @@ def label(
 ) -> None:
     """Name an instance; the name survives merges and later sessions.
 
-    Example: list3r label house.l3r 12 "my mug"
+    Example: list3r edit label house.l3r 12 "my mug"
     """
     _run_edit(memory, lambda scene: scene.label(instance_id, text, author=author), json)
 
@@ -137,9 +137,48 @@ def delete(
 ) -> None:
     """Remove an instance, also from later sessions; undo brings it back.
 
-    Example: list3r delete house.l3r 12
+    Example: list3r edit delete house.l3r 12
     """
     _run_edit(memory, lambda scene: scene.delete(instance_id, author=author), json)
+
+
+def scale(
+    memory: MemoryArgument,
+    anchor: Annotated[
+        str | None,
+        typer.Option(
+            "--anchor",
+            metavar="ANCHOR",
+            help="A length that you know: ID=0.095m (longest edge), ID.height=0.095m, camera_height=1.5m (median over "
+            "the floor), or x,y,z:x,y,z=1.2m between two points.",
+            show_default=False,
+        ),
+    ] = None,
+    author: AuthorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Give one known length, so that all lengths become metres. Without --anchor, show the scale and its source.
+
+    Example: list3r edit scale house.l3r --anchor "12=0.095m"
+    """
+    if anchor is not None:
+        from list3r.pipeline.finishing import anchor_scale
+
+        report = anchor_scale(memory, anchor, author)
+        if not json:
+            say(f"{report.text} (entry {report.entry})")
+    with open_memory(memory) as scene:
+        kind, source = (scene.store.facts.scale_kind or "relative"), scene.store.facts.scale_source
+        units = scene.lengths
+    if json:
+        result = None if anchor is None else report.as_dict()
+        print_answer([{"scale": kind, "scale_source": source, "edit": result}], units)
+    elif kind == "guessed":
+        say(f'scale guessed: lengths are about metres ({source}); --anchor "ID=0.095m" makes them metres')
+    elif kind == "relative":
+        say('scale relative: the length of a unit is unknown; --anchor "ID=0.095m" turns units into metres')
+    else:
+        say(f"scale {kind}: lengths are metres ({source})")
 
 
 def _run_edit(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool) -> None:
@@ -166,3 +205,12 @@ def _parse_parts(text: str) -> list[tuple[int, int]]:
         return [(int(chunk), int(local)) for chunk, local in pairs]
     except ValueError:
         raise OptionError(f"--out {text!r}: give CHUNK:LOCAL pairs separated by commas, such as 3:4,5:2") from None
+
+
+edit = typer.Typer(
+    help="Correct a memory: name, merge, split or delete instances, give a length, undo.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+for command in (label, merge, split, delete, scale, undo, log):
+    edit.command(command.__name__)(command)

@@ -7,7 +7,6 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,10 +14,9 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, spread
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import note, say
 from list3r.exporters.registry import FORMATS, find_format
-from list3r.pipeline.request import option
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -29,37 +27,6 @@ _FORMAT_OPTION = typer.Option(
 )
 
 
-@dataclass(frozen=True)
-class ExportArguments:
-    """Options of some formats. Omitted ones take the default of the format."""
-
-    color: str | None = field(default=None, metadata=option("ply, glb: rgb (as seen) or instance.", "rgb|instance"))
-    tokens: int | None = field(default=None, metadata=option("prompt: most tokens of the text; default: 2000.", "N"))
-    question: str | None = field(
-        default=None, metadata=option("prompt: a question; instances it asks about come first.", "TEXT")
-    )
-    mesh: bool = field(
-        default=False, metadata=option("usd: write a closed mesh of each instance instead of its points.")
-    )
-    colliders: bool = field(default=False, metadata=option("usd: write meshes with colliders."))
-    density: float | None = field(
-        default=None, metadata=option("simready: kg per cubic metre of the hull, for an estimated mass.", "KG/M3")
-    )
-    ids: str | None = field(default=None, metadata=option("simready: only these instances, such as 3,7,12.", "ID,..."))
-
-    guessed_metre: bool = field(
-        default=False, metadata=option("simready: take a guessed metre for one; lengths and masses are as wrong as it.")
-    )
-    workers: int | None = field(
-        default=None, metadata=option("simready: worker processes; 0: work in this process.", "N")
-    )
-
-    def given(self) -> dict[str, Any]:
-        """Return the options that are not left out. Raises `OptionError`."""
-        options = {name: value for name, value in asdict(self).items() if value not in (None, False)}
-        return options if self.ids is None else {**options, "ids": _ids(self.ids)}
-
-
 def _ids(text: str) -> tuple[int, ...]:
     from list3r.memory.core.errors import OptionError
 
@@ -68,15 +35,52 @@ def _ids(text: str) -> tuple[int, ...]:
     return tuple(map(int, text.split(",")))
 
 
-@spread
 def export(
     memory: MemoryArgument,
     to: Annotated[str, _FORMAT_OPTION],
     out: Annotated[
         Path, typer.Option("--out", metavar="PATH", help="The file or folder to write; - for standard output.")
     ],
-    *,
-    words: ExportArguments,
+    color: Annotated[
+        str | None,
+        typer.Option(
+            "--color",
+            metavar="rgb|instance",
+            help="ply, glb: rgb (as seen) or instance.",
+            autocompletion=lambda: ["rgb", "instance"],
+        ),
+    ] = None,
+    tokens: Annotated[
+        int | None, typer.Option("--tokens", metavar="N", help="prompt: most tokens of the text; default: 2000.")
+    ] = None,
+    question: Annotated[
+        str | None,
+        typer.Option("--question", metavar="TEXT", help="prompt: a question; instances it asks about come first."),
+    ] = None,
+    mesh: Annotated[
+        bool, typer.Option("--mesh", help="usd: write a closed mesh of each instance instead of its points.")
+    ] = False,
+    colliders: Annotated[bool, typer.Option("--colliders", help="usd: write meshes with colliders.")] = False,
+    density: Annotated[
+        float | None,
+        typer.Option(
+            "--density", metavar="KG/M3", help="simready: kg per cubic metre of the hull, for an estimated mass."
+        ),
+    ] = None,
+    ids: Annotated[
+        str | None, typer.Option("--ids", metavar="ID,...", help="simready: only these instances, such as 3,7,12.")
+    ] = None,
+    guessed_metre: Annotated[
+        bool,
+        typer.Option(
+            "--guessed-metre",
+            help="simready: take a guessed metre for one; lengths and masses are as wrong as it.",
+        ),
+    ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", metavar="N", help="simready: worker processes; 0: work in this process."),
+    ] = None,
     min_confidence: Annotated[
         float | None,
         typer.Option(
@@ -93,7 +97,18 @@ def export(
     """
     from list3r.memory.core.errors import OptionError
 
-    options = words.given()
+    asked: dict[str, Any] = {
+        "color": color,
+        "tokens": tokens,
+        "question": question,
+        "mesh": mesh,
+        "colliders": colliders,
+        "density": density,
+        "ids": None if ids is None else _ids(ids),
+        "guessed_metre": guessed_metre,
+        "workers": workers,
+    }
+    options = {name: value for name, value in asked.items() if value is not None and value is not False}
     if out == Path("-"):
         if json:
             raise OptionError("--out - and --json both write to standard output; leave one out")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,10 +35,9 @@ if TYPE_CHECKING:
     from list3r.memory.core.geometry import Sim3
 
 
-@dataclass(frozen=True)
-class CloudArguments:
-    """How clouds are placed, thinned and compared."""
-
+def cloud(
+    truth: Truth,
+    estimate: Estimate,
     align: Annotated[
         list[str] | None,
         typer.Option(
@@ -47,25 +46,24 @@ class CloudArguments:
             help="How to align the estimate: by its camera path, by its surfaces (ICP), or, given twice, by one after "
             "the other. Default: by the path if TRUTH is a source, else none.",
         ),
-    ] = None
+    ] = None,
     path: Annotated[
         Path | None,
         typer.Option("--path", metavar="TRAJECTORY", help="Camera path of the estimate, if it is not a memory."),
-    ] = None
-    scale: ScaleOption = "auto"
-    threshold: Annotated[float, typer.Option("--threshold", help="Distance threshold of the F-score, metres.")] = 0.05
+    ] = None,
+    scale: ScaleOption = "auto",
+    threshold: Annotated[float, typer.Option("--threshold", help="Distance threshold of the F-score, metres.")] = 0.05,
     truncate: Annotated[
         float | None, typer.Option("--truncate", help="Cap each distance at this, metres; default: no cap.")
-    ] = None
+    ] = None,
     voxel: Annotated[
         float, typer.Option("--voxel", help="Thin both clouds to one point per cell of this size, metres; 0: keep all.")
-    ] = 0.01
-    points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000
-    every: EveryOption = None
-    plot: PlotOption = None
-
-
-def cloud(truth: Truth, estimate: Estimate, asked: CloudArguments, json: JsonOption = False) -> None:
+    ] = 0.01,
+    points: Annotated[int, typer.Option("--points", help="Most points of either cloud, drawn at random.")] = 1_000_000,
+    every: EveryOption = None,
+    plot: PlotOption = None,
+    json: JsonOption = False,
+) -> None:
     """Accuracy, completeness, Chamfer, normal consistency, F-score. TRUTH: a cloud or mesh, a memory, or a source with
     depth and poses; ESTIMATE: a cloud or a memory (all supports of its instances and surfaces, in the world).
 
@@ -74,28 +72,26 @@ def cloud(truth: Truth, estimate: Estimate, asked: CloudArguments, json: JsonOpt
     from list3r.evaluation.cloud import cloud_distances, evaluate_cloud
     from list3r.evaluation.point_clouds import thinned
 
-    check_scale(asked.scale)
-    check_every(asked.every)
-    check_plot(asked.plot)
-    _check_lengths(threshold=asked.threshold, truncate=asked.truncate)
+    check_scale(scale)
+    check_every(every)
+    check_plot(plot)
+    _check_lengths(threshold=threshold, truncate=truncate)
     found, _ = read_points(estimate)
-    true, true_path = read_points(truth, asked.every)
-    true = thinned(true, asked.voxel, asked.points)
+    true, true_path = read_points(truth, every)
+    true = thinned(true, voxel, points)
     true = replace(true, normals=_normals(true))
-    S_truth_estimate, how = _cloud_alignment(asked, (true, true_path, truth), (found, asked.path or estimate))
-    found = thinned(found.moved(S_truth_estimate), asked.voxel, asked.points)
+    S_truth_estimate, how = _cloud_alignment(align, scale, (true, true_path, truth), (found, path or estimate))
+    found = thinned(found.moved(S_truth_estimate), voxel, points)
     distances = cloud_distances(true.points, found.points)
-    errors = evaluate_cloud(
-        true.points, found.points, (true.normals, _normals(found)), asked.threshold, asked.truncate, distances
-    )
-    if asked.plot is not None:
+    errors = evaluate_cloud(true.points, found.points, (true.normals, _normals(found)), threshold, truncate, distances)
+    if plot is not None:
         title = (
             f"{estimate.name} against {truth.name}: Chamfer {errors.chamfer_cm:.2f} cm, F {100 * errors.f_score:.1f} %"
         )
         gaps = (distances.to_truth, distances.to_estimate)
-        save_picture(_figure(found, true, gaps, 2 * asked.threshold, title, true_path), asked.plot)
+        save_picture(_figure(found, true, gaps, 2 * threshold, title, true_path), plot)
     if json:
-        used = {"truth": true.text, "estimate": found.text, "alignment": how, "voxel_m": asked.voxel}
+        used = {"truth": true.text, "estimate": found.text, "alignment": how, "voxel_m": voxel}
         counts = {"truth_points": len(true.points), "estimate_points": len(found.points)}
         print_answer([{**errors.as_dict(), **used, **counts, "scale": float(S_truth_estimate.scale)}])
         return
@@ -133,7 +129,10 @@ def _figure(
 
 
 def _cloud_alignment(
-    asked: CloudArguments, truth: tuple[PointCloud, Trajectory | None, Path], estimate: tuple[PointCloud, Path]
+    align: list[str] | None,
+    scale: str,
+    truth: tuple[PointCloud, Trajectory | None, Path],
+    estimate: tuple[PointCloud, Path],
 ) -> tuple[Sim3, str]:
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register
@@ -142,9 +141,9 @@ def _cloud_alignment(
     from list3r.memory.core.geometry import Sim3
 
     (true, true_path, source), (found, estimate_path) = truth, estimate
-    by_source = asked.align is None and is_source(source) and true_path is not None
-    chosen = asked.align or (["path"] if by_source else ["none"])
-    free = free_scale(asked.scale, estimate_path)
+    by_source = align is None and is_source(source) and true_path is not None
+    chosen = align or (["path"] if by_source else ["none"])
+    free = free_scale(scale, estimate_path)
     kind = "Sim(3)" if free else "SE(3)"
     S, steps = Sim3.identity(), []
     for word in chosen:

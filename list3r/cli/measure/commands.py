@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, open_memory, print_table, spread
+from list3r.cli.common import JsonOption, open_memory, print_table
 from list3r.cli.measure.cloud import cloud
 from list3r.cli.measure.inputs import align_by_path, mask_frames, read_scene_of, read_trajectory
 from list3r.cli.measure.options import (
@@ -38,16 +37,15 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------------------------------------- trajectory
 
 
-@dataclass(frozen=True)
-class TrajectoryArguments:
-    """How poses are associated and placed."""
-
+def trajectory(
+    truth: Truth,
+    estimate: Estimate,
     delta: Annotated[
         str, typer.Option("--delta", help="Distance between the poses that RPE compares: 10 (frames), 0.5m or 2s.")
-    ] = "1"
+    ] = "1",
     tolerance: Annotated[
         float, typer.Option("--tolerance", help="Largest time difference of associated poses, seconds.")
-    ] = 0.01
+    ] = 0.01,
     scale: Annotated[
         str,
         typer.Option(
@@ -55,11 +53,10 @@ class TrajectoryArguments:
             metavar="auto|free|fixed",
             help="Alignment in the picture; auto: free for a memory of relative scale.",
         ),
-    ] = "auto"
-    plot: PlotOption = None
-
-
-def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryArguments, json: JsonOption = False) -> None:
+    ] = "auto",
+    plot: PlotOption = None,
+    json: JsonOption = False,
+) -> None:
     """ATE and RPE of a trajectory. TRUTH and ESTIMATE: a file (TUM, EuRoC, KITTI), a memory, or a source with poses.
 
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
@@ -67,18 +64,17 @@ def trajectory(truth: Truth, estimate: Estimate, asked: TrajectoryArguments, jso
     from list3r.evaluation.trajectory import Delta, evaluate_trajectory
     from list3r.memory.core.errors import OptionError
 
-    tolerance = asked.tolerance
-    check_scale(asked.scale)
-    check_plot(asked.plot)
+    check_scale(scale)
+    check_plot(plot)
     if not tolerance >= 0:
         raise OptionError(f"--tolerance {tolerance:g}: give 0 or more seconds")
-    apart = Delta.parse(asked.delta)
+    apart = Delta.parse(delta)
     true, found = read_trajectory(truth), read_trajectory(estimate)
     errors = evaluate_trajectory(true, found, tolerance, delta=apart)
-    if asked.plot is not None:
-        free = free_scale(asked.scale, estimate)
+    if plot is not None:
+        free = free_scale(scale, estimate)
         save_picture(
-            _trajectory_figure(true, found, tolerance, f"{estimate.name} against {truth.name}", free=free), asked.plot
+            _trajectory_figure(true, found, tolerance, f"{estimate.name} against {truth.name}", free=free), plot
         )
     scores = errors.as_dict()
     if json:
@@ -111,10 +107,9 @@ def _trajectory_figure(truth: Trajectory, estimate: Trajectory, tolerance: float
 # ---------------------------------------------------------------------------------------------- instances
 
 
-@dataclass(frozen=True)
-class InstanceArguments:
-    """How a scene is placed, and where true ids are."""
-
+def instances(
+    truth: Truth,
+    estimate: Estimate,
     align: Annotated[
         str | None,
         typer.Option(
@@ -122,8 +117,8 @@ class InstanceArguments:
             metavar="TRAJECTORY|none",
             help="True camera path, by which a memory is aligned. Default: groundtruth.txt next to TRUTH, if present.",
         ),
-    ] = None
-    scale: ScaleOption = "auto"
+    ] = None,
+    scale: ScaleOption = "auto",
     ids: Annotated[
         Path | None,
         typer.Option(
@@ -131,12 +126,11 @@ class InstanceArguments:
             metavar="FOLDER",
             help="Folder with images of true ids, to count the id switches of a memory. Default: ids/ next to TRUTH.",
         ),
-    ] = None
-    every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1
-    plot: PlotOption = None
-
-
-def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: JsonOption = False) -> None:
+    ] = None,
+    every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1,
+    plot: PlotOption = None,
+    json: JsonOption = False,
+) -> None:
     """Recall, precision, duplicates, merges, id switches; relations. TRUTH: a truth.json; ESTIMATE: a memory or scene
     JSON.
 
@@ -145,23 +139,22 @@ def instances(truth: Truth, estimate: Estimate, asked: InstanceArguments, json: 
     from list3r.evaluation.scene import evaluate_scene, read_scene
     from list3r.memory.core.errors import OptionError
 
-    align = asked.align
     if align not in (None, "none") and estimate.is_file() and not is_database(estimate):
         raise OptionError(f"--align {align} aligns a memory; {estimate} is not one and has no camera path")
-    check_scale(asked.scale)
-    check_plot(asked.plot)
-    check_every(asked.every)
+    check_scale(scale)
+    check_plot(plot)
+    check_every(every)
     true, found = read_scene(truth), read_scene_of(estimate)
     groundtruth = truth.parent / "groundtruth.txt"
     if align is None and is_database(estimate) and groundtruth.is_file():
         align = str(groundtruth)
-    free = free_scale(asked.scale, estimate)
+    free = free_scale(scale, estimate)
     S_truth_scene = None if align in (None, "none") else align_by_path(Path(str(align)), estimate, free=free)
     scores = evaluate_scene(found, true, S_truth_scene)
-    scores["identities"] = _identities(true, truth, estimate, asked.ids, asked.every)
-    if asked.plot is not None:
+    scores["identities"] = _identities(true, truth, estimate, ids, every)
+    if plot is not None:
         save_picture(
-            _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), asked.plot
+            _instances_figure(true, found, scores, S_truth_scene, f"{estimate.name} against {truth.name}"), plot
         )
     if json:
         print_answer([scores])
@@ -230,4 +223,4 @@ def score_rows(scores: dict[str, Any]) -> list[list[object]]:
 
 measures = typer.Typer(help="Compare a result with ground truth.", no_args_is_help=True, rich_markup_mode=None)
 for command in (trajectory, cloud, instances, revisits):
-    measures.command(command.__name__)(spread(command))
+    measures.command(command.__name__)(command)

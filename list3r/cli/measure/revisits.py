@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,35 +26,28 @@ if TYPE_CHECKING:
     from list3r.evaluation.revisits import RevisitScores
 
 
-@dataclass(frozen=True)
-class RevisitArguments:
-    """How loops are judged."""
-
+def revisits(
+    truth: Truth,
+    memory: Annotated[Path, typer.Argument(metavar="MEMORY", show_default=False)],
     least: Annotated[
         float,
         typer.Option("--least", help="A revisit is a pair of frames that share at least this part of the surface."),
-    ] = 0.3
+    ] = 0.3,
     different: Annotated[
         float,
         typer.Option(
             "--different",
             help="Frames that share less than this see different places; pairs between the two are not counted.",
         ),
-    ] = 0.1
-    precision: Annotated[float, typer.Option("--precision", help="Precision at which rankings are compared.")] = 0.99
-    session: Annotated[int, typer.Option("--session", help="The session of the memory that TRUTH belongs to.")] = 1
-    every: EveryOption = None
+    ] = 0.1,
+    precision: Annotated[float, typer.Option("--precision", help="Precision at which rankings are compared.")] = 0.99,
+    session: Annotated[int, typer.Option("--session", help="The session of the memory that TRUTH belongs to.")] = 1,
+    every: EveryOption = None,
     save: Annotated[
         Path | None,
         typer.Option("--save", metavar="FILE", help="Write the covisibility as .npz, to use as TRUTH next time."),
-    ] = None
-    plot: PlotOption = None
-
-
-def revisits(
-    truth: Truth,
-    memory: Annotated[Path, typer.Argument(metavar="MEMORY", show_default=False)],
-    asked: RevisitArguments,
+    ] = None,
+    plot: PlotOption = None,
     json: JsonOption = False,
 ) -> None:
     """Precision and recall of loops against covisibility. TRUTH: the source with depth and poses, or an .npz of frame
@@ -68,20 +60,20 @@ def revisits(
     from list3r.exporters.output import check_target, replacing
     from list3r.memory.core.errors import OptionError
 
-    settings = RevisitTruthSettings(asked.least, asked.different, asked.precision)
-    check_every(asked.every)
-    check_plot(asked.plot)
-    if asked.save is not None:
-        if asked.save.suffix.lower() != ".npz":
-            raise OptionError(f"--save {asked.save}: the file must end in .npz")
-        check_target(asked.save)
+    settings = RevisitTruthSettings(least, different, precision)
+    check_every(every)
+    check_plot(plot)
+    if save is not None:
+        if save.suffix.lower() != ".npz":
+            raise OptionError(f"--save {save}: the file must end in .npz")
+        check_target(save)
     with open_memory(memory) as scene:
-        chunks = [c for c in scene.store.chunks.all() if c.session_id == asked.session]
-        frames = scene.store.frames.all(asked.session)
+        chunks = [c for c in scene.store.chunks.all() if c.session_id == session]
+        frames = scene.store.frames.all(session)
         edges = scene.store.edges.all()
     if not chunks:
-        raise OptionError(f"{memory} has no session {asked.session}; `list3r info` lists them")
-    found = read_covisibility_of(truth, asked.every)
+        raise OptionError(f"{memory} has no session {session}; `list3r info` lists them")
+    found = read_covisibility_of(truth, every)
     _check_clock(truth, found.frame, found.time_s, {f.frame_index: f.time_s for f in frames if f.state != "bad"})
     spans = {c.chunk_id: (c.first_frame, c.last_frame) for c in chunks}
     inside = [e for e in edges if e.u in spans and e.v in spans]
@@ -90,13 +82,13 @@ def revisits(
     ]
     judged = judge(Candidates.of_edges(inside), found, spans, neighbours, settings)
     scores = score([judged], settings)
-    if asked.save is not None:
-        with replacing(asked.save) as temporary:
+    if save is not None:
+        with replacing(save) as temporary:
             write_covisibility(temporary, found)
-    if asked.plot is not None:
+    if plot is not None:
         from list3r.evaluation.figures import revisits_figure
 
-        save_picture(revisits_figure(found.frame, found.share, judged, f"loop candidates of {memory.name}"), asked.plot)
+        save_picture(revisits_figure(found.frame, found.share, judged, f"loop candidates of {memory.name}"), plot)
     if json:
         counts = {"covisible_frames": len(found.frame), "pairs_of_chunks": len(judged.true_pairs)}
         print_answer([{**scores.as_dict(), **counts}])

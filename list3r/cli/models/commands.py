@@ -11,7 +11,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import watching
-from list3r.cli.common import JsonOption, only, print_table, spread
+from list3r.cli.common import JsonOption, LicenceOption, only, print_table, spread
 from list3r.cli.terminal import say
 from list3r.pipeline.request import BuildRequest, RunOptions
 
@@ -60,11 +60,9 @@ def list_models(
 
 
 @models.command("fetch")
-@spread
 def fetch_model(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A model, or owner/name of weights.", show_default=False)],
-    *,
-    run: Annotated[RunOptions, only("licence")],
+    licence: LicenceOption = "research",
     revision: Annotated[
         str | None,
         typer.Option("--revision", help="Commit, tag or branch; default: the card's.", show_default=False),
@@ -78,7 +76,7 @@ def fetch_model(
     from list3r.models.cache import fetch, find_cached
 
     done = []
-    for weights in _wanted(name, run.licence):
+    for weights in _wanted(name, licence):
         before = find_cached(weights.repository, revision or weights.revision)
         cached = fetch(weights, revision)
         done.append({"weights": cached.name, "folder": str(cached.folder), "bytes": cached.size_bytes})

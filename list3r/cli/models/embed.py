@@ -8,22 +8,19 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, only, spread
+from list3r.cli.common import JsonOption, LicenceOption, MemoryArgument
 from list3r.cli.terminal import say
-from list3r.pipeline.request import RunOptions
 
 
-@spread
 def embed(
     memory: MemoryArgument,
-    *,
     model: Annotated[str, typer.Option("--model", metavar="siglip2|clip", help="The text-image model.")] = "siglip2",
     weights: Annotated[
         str | None,
         typer.Option("--weights", metavar="DIR|REPOSITORY", help="Weights instead of the model's own."),
     ] = None,
     device: Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where it runs.")] = "auto",
-    run: Annotated[RunOptions, only("licence")],
+    licence: LicenceOption = "research",
     json: JsonOption = False,
 ) -> None:
     """Embed every instance with a text-image model, so that any words can find it.
@@ -33,7 +30,7 @@ def embed(
     from list3r.semantics.embedding import embed_memory
 
     with progress_bar("embedding", "chunks", quiet=json) as bar:
-        report = embed_memory(memory, weights, device, bar.show, model=model, licence=run.licence)
+        report = embed_memory(memory, weights, device, bar.show, model=model, licence=licence)
     if json:
         print_answer([vars(report)])
         return

@@ -39,8 +39,8 @@ class Budget:
             if self.used + cost > room:
                 break
             kept += 1
-        if kept:
-            self.add(head + " " + separator.join(items[:kept]))
+        while kept and not self.add(head + " " + separator.join(items[:kept])):
+            kept -= 1
         return kept
 
     def text(self) -> str:

@@ -17,6 +17,7 @@ from list3r.exporters.prompt.cognitive_map import cognitive_maps
 from list3r.exporters.prompt.coverage import cover
 from list3r.exporters.prompt.marks import draw_marks
 from list3r.exporters.prompt.scene_text import scene_prompt
+from list3r.exporters.prompt.tokens import counted_by
 from list3r.memory.core.errors import OptionError
 from list3r.queries.pictures import KeyframePicture
 
@@ -35,8 +36,6 @@ class PackSettings:
     """Budget of the text."""
     question: str | None = None
     """Instances that it names come first."""
-    objects_on_grids: int = 2000
-    """In a memory of more instances the grids of the cognitive map hold only instances with a row in the text."""
     least_visible: float = 0.3
     """Share of an instance that must show for a view to count for it."""
     least_side_px: float = 12.0
@@ -56,9 +55,8 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
     listed = [n for n in prompt.listed if n in objects]
     with replacing_folder(folder, "prompt") as temporary:
         (temporary / "scene.md").write_text(prompt.text, encoding="utf-8")
-        gridded = objects if len(objects) <= settings.objects_on_grids else set(listed)
-        maps = cognitive_maps([i for i in instances if i.id in gridded], memory.units)
-        maps["left_out"] = len(objects) - len(gridded)
+        maps = cognitive_maps([i for i in instances if i.id in set(listed)], memory.units)
+        maps["left_out"] = len(objects) - len(listed)
         (temporary / "cognitive_map.json").write_text(json.dumps(maps, indent=1) + "\n", encoding="utf-8")
         memory.export("plan", temporary / "map.png")
         views = _write_views(memory, temporary / "views", listed, settings)
@@ -69,6 +67,7 @@ def write_prompt(memory: SceneMemory, folder: str | Path, settings: PackSettings
             "memory": memory.path.name,
             "question": settings.question,
             "tokens": prompt.tokens,
+            "counted_by": counted_by(),
             "listed": list(prompt.listed),
             "views": views,
             "without_picture": sorted(set(listed) - crops),

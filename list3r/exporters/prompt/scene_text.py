@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from list3r.exporters.prompt.budget import Budget
 from list3r.memory.core.description.printable import shown, shown_between
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Instance, Relation
+from list3r.queries.find import Found
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -69,16 +70,17 @@ def scene_prompt(
     ranked = ranked_instances(objects, question or "", {} if found is None else found.mentioned)
     budget = Budget(tokens)
     writer = _SceneWriter(memory, objects, settings)
-    for line in writer.head():
+    head = writer.head()
+    if question and found is not None:
+        head += _unresolved(question, found, {i.id for i in objects})
+    for line in head:
         if not budget.add(line):
-            needed = sum(_cost(x) for x in writer.head())
+            needed = sum(_cost(x) for x in head)
             raise OptionError(f"{tokens} tokens are too few: the head of the text alone takes {needed}; allow more")
-    if found is not None and not (found and found.exact):
-        budget.add(_unresolved(question or "", found.unknown_words))
     listed = writer.rows(budget, ranked)
     if len(listed) < len(objects):
         writer.counts(budget, [name_of(i) for i in listed] if question else [])
-    writer.changes(budget)
+    writer.changes(budget, listed)
     writer.gaps(budget, listed)
     writer.relations(budget, listed)
     return ScenePrompt(budget.text(), budget.used, tuple(i.id for i in listed), len(objects))
@@ -90,10 +92,19 @@ def _cost(line: str) -> int:
     return budget.used
 
 
-def _unresolved(question: str, unknown: Sequence[str]) -> str:
-    """Say what of a question the memory does not know."""
-    words = f"no instance is known as {', '.join(map(repr, unknown))}" if unknown else "no instance fits all of it"
-    return shown(f"Question {question[:80]!r}: {words}.")
+def _unresolved(question: str, found: Found, known: Collection[int]) -> list[str]:
+    """Return the line that says what of a question the memory does not know; none where it knows all of it."""
+    unknown = [repr(word) for word in found.unknown_words]
+    unknown += [f"#{n}" for n in dict.fromkeys(_written(question)) if n not in known]
+    if not unknown and found and found.exact:
+        return []
+    words = f"no instance is known as {', '.join(unknown)}" if unknown else "no instance fits all of it"
+    return [shown(f"Question {question[:80]!r}: {words}.")]
+
+
+def _written(question: str) -> list[int]:
+    """Return the ids that a question names, such as #12."""
+    return [int(n) for n in re.findall(r"#(\d+)\b", question)]
 
 
 def ranked_instances(
@@ -107,7 +118,7 @@ def ranked_instances(
     if not question:
         return usual
     named = dict(mentioned or {})
-    written = {int(n) for n in re.findall(r"#(\d+)\b", question)}
+    written = set(_written(question))
     named |= {i.id: 2.0 for i in objects if i.id in written}
     if not named:
         return usual
@@ -192,19 +203,25 @@ class _SceneWriter:
                 break
         keep = 0 if whole <= budget.left else int((1.0 - self.settings.share_of_rows) * budget.tokens)
         out = []
+        room = budget.left - keep
         for i, line in lines:
-            if not budget.add(line, keep=keep):
+            room -= _cost(line)
+            if room < 0:
                 break
             out.append(i)
+        listed = {i.id for i in out}
+        for i in out:
+            budget.add(self.row(i, listed))  # never longer than with what it names
         return out
 
-    def row(self, i: Instance) -> str:
+    def row(self, i: Instance, listed: Collection[int] | None = None) -> str:
+        """Return the row of an instance; with `listed` it names no other one."""
         unsure = "?" if i.confidence < self.settings.unsure_below else ""
         cells = [f"{i.id} {self.names[i.id]}{unsure}"]
         if np.isfinite(i.center).all() and np.isfinite(i.box.size).all():
             cells += [self.triple(i.center, ","), self.triple(i.box.size, "x") + self.turn(i)]
         held = self.holders.get(i.id)
-        if held is not None:
+        if held is not None and (listed is None or held.object in listed):
             cells.append(f"{held.predicate.replace('_', ' ')} {held.object}")
         if i.dynamic or i.state not in ("present", "unseen"):
             cells.append("moving" if i.dynamic else i.state)
@@ -227,28 +244,30 @@ class _SceneWriter:
         names = dict.fromkeys([*first, *common])
         budget.add_list("In all:", [f"{count[name]} {name}" for name in names], share=self.settings.share_of_counts)
 
-    def changes(self, budget: Budget) -> None:
-        """Add the changes of the last session."""
+    def changes(self, budget: Budget, listed: Sequence[Instance]) -> None:
+        """Add the changes of the last session; what has no row, as what is gone, by its name alone."""
+        rows = {i.id for i in listed}
         found = self.memory.changes()
         newest = max((c.event.session_id for c in found), default=0)
         items = []
         for c in found:
             if c.event.session_id == newest:
                 far = "" if c.distance_m is None else f" {self.number(c.distance_m)}"
-                items.append(f"{c.instance.id} {name_of(c.instance)} {c.event.kind}{far}")
+                number = f"{c.instance.id} " if c.instance.id in rows else ""
+                items.append(f"{number}{name_of(c.instance)} {c.event.kind}{far}")
         if items:
             budget.add_list("Changed last:", items)
 
     def gaps(self, budget: Budget, listed: Sequence[Instance]) -> None:
-        """Add the nearest instances of each listed instance with the gap between their surfaces."""
-        items, written, cost = [], set[frozenset[int]](), 0
+        """Add which of the nearest instances of each listed one have a row, with the gap between their surfaces."""
+        items, written, cost, rows = [], set[frozenset[int]](), 0, {i.id for i in listed}
         for i in listed:
             if i.structure is not None or cost > budget.left:
                 continue
             near = []
             for m in self.memory.nearest(i.id, k=self.settings.neighbours):
                 pair = frozenset((i.id, m.instance.id))
-                if m.distance_m is not None and pair not in written:
+                if m.instance.id in rows and m.distance_m is not None and pair not in written:
                     written.add(pair)
                     near.append(f"{m.instance.id} {self.number(m.distance_m)}")
             if near:

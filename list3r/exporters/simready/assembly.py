@@ -61,7 +61,7 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
     guessed = lengths_of(store).metric == "guessed"
     if units(store) != "m" and not (guessed and settings.guessed_metre):
         raise OptionError(
-            f"{store.path.name} has no metric scale, which a simulator needs: `list3r scale --anchor` gives it one"
+            f"{store.path.name} has no metric scale, which a simulator needs: `list3r edit scale --anchor` gives it one"
             + (", --guessed-metre takes the guess" if guessed else "")
         )
     objects, structure = _chosen(store, settings)

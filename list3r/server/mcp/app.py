@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hmac
+import json
 import secrets
 import socket
 import tempfile
@@ -15,9 +16,9 @@ from typing import Any
 from mcp.server import MCPServer
 from mcp.server.auth.provider import AccessToken
 from mcp.server.auth.settings import AuthSettings
-from mcp.server.mcpserver.exceptions import ToolError
+from mcp.server.mcpserver.exceptions import ResourceError, ToolError
 from mcp.server.transport_security import TransportSecuritySettings
-from mcp.types import ToolAnnotations
+from mcp.types import CallToolResult, TextContent, ToolAnnotations
 from pydantic import AnyHttpUrl
 
 from list3r import __version__
@@ -26,6 +27,7 @@ from list3r.catalog import Catalog
 from list3r.memory.core.errors import List3rError, OptionError
 from list3r.server.mcp.catalog import CatalogTools
 from list3r.server.mcp.reading import ReadingTools
+from list3r.server.mcp.words import answer_of_tools, of_tools
 from list3r.server.mcp.writing import WritingTools
 
 HOST = "127.0.0.1"
@@ -90,12 +92,12 @@ def make_server(served: SceneMemory | Catalog, *, http: HttpSettings | None = No
         **guard,
     )
     for tool in _public_methods(CatalogTools(served) if isinstance(served, Catalog) else ReadingTools(served)):
-        server.tool(annotations=ToolAnnotations(read_only_hint=True, open_world_hint=False))(_with_errors(tool))
+        _add_tool(server, tool, served, reads=True)
     if isinstance(served, Catalog):
         return server
     if served.writable:
         for tool in _public_methods(WritingTools(served)):
-            server.tool(annotations=ToolAnnotations(read_only_hint=False, open_world_hint=False))(_with_errors(tool))
+            _add_tool(server, tool, served, reads=False)
     _add_resources(server, served)
     _add_prompts(server)
     return server
@@ -153,17 +155,32 @@ def _public_methods(tools: object) -> Iterator[Callable[..., Any]]:
             yield getattr(tools, name)
 
 
-def _with_errors(tool: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the same tool; errors that the user can fix reach the agent as one line."""
+def _add_tool(server: MCPServer[Any], tool: Callable[..., Any], served: SceneMemory | Catalog, *, reads: bool) -> None:
+    hints = ToolAnnotations(read_only_hint=reads, open_world_hint=False)
+    title = tool.__name__.replace("_", " ").capitalize()
+    server.tool(title=title, annotations=hints)(_answering(tool, served))
+
+
+def _answering(tool: Callable[..., Any], served: SceneMemory | Catalog) -> Callable[..., Any]:
+    """Return the same tool; answers are compact, errors that the user can fix reach the agent as one line."""
+    path = "" if isinstance(served, Catalog) else str(served.path)
 
     @functools.wraps(tool)
     def call(*args: Any, **kwargs: Any) -> Any:
         try:
-            return tool(*args, **kwargs)
+            answer = tool(*args, **kwargs)
         except List3rError as error:
-            raise ToolError(str(error)) from error
+            raise ToolError(of_tools(str(error), path)) from error
+        if not isinstance(answer, dict):
+            return answer
+        plain = answer_of_tools(answer, path)
+        return CallToolResult(content=[TextContent(type="text", text=_compact(plain))], structured_content=plain)
 
     return call
+
+
+def _compact(answer: dict[str, Any]) -> str:
+    return json.dumps(answer, ensure_ascii=False, separators=(",", ":"), default=str)
 
 
 def _add_resources(server: MCPServer[Any], memory: SceneMemory) -> None:
@@ -179,9 +196,12 @@ def _add_resources(server: MCPServer[Any], memory: SceneMemory) -> None:
             return memory.export("plan", Path(folder) / "map.png")[0].read_bytes()
 
     @server.resource("list3r://instance/{id}", mime_type="application/json")
-    def instance(id: int) -> dict[str, Any]:
+    def instance(id: int) -> str:
         """All that is known of one instance."""
-        return ReadingTools(memory).describe(id)
+        try:
+            return _compact(ReadingTools(memory).describe(id))
+        except List3rError as error:
+            raise ResourceError(of_tools(str(error), str(memory.path))) from error
 
 
 def _add_prompts(server: MCPServer[Any]) -> None:

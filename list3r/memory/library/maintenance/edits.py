@@ -157,7 +157,7 @@ def _undo_decision(store: Store, entry: int, author: str | None) -> EditReport:
     """Decide otherwise what merging decided, by an edit of the two local instances that it spoke of."""
     found = next((e for e in store.merges.all() if e.entry == entry), None)
     if found is None:
-        raise OptionError(f"the log has no entry {entry}; `list3r merges {store.path}` shows all")
+        raise OptionError(f"the log has no entry {entry}; `list3r edit log {store.path}` shows all")
     d = found.decision
     if d.kind not in ("merge", "refuse"):
         raise OptionError(f"entry {entry} ({d.kind}) only records what became of ids; undo the merge that led to it")

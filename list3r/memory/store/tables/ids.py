@@ -45,7 +45,7 @@ class Ids:
             current = current if target is None else target.instance
         path, entry = self._connection.path, self._deletion_of(wanted)
         if entry is not None:
-            raise UnknownIdError(f"#{wanted} was deleted; `list3r undo {path} {entry}` brings it back")
+            raise UnknownIdError(f"#{wanted} was deleted; `list3r edit undo {path} {entry}` brings it back")
         raise UnknownIdError(f"{path} has no instance {instance_id}; `list3r list {path}` shows the ids")
 
     def next(self) -> int:
