@@ -16,17 +16,20 @@ descriptors and joint windows, and chunks end at cuts in all of them but the fir
 
 - vggt-long: as published, `benchmarks/peers/vggt_long.py`, which detects no cuts;
 - vggt-long-cuts: the same on chunks that end at cuts;
-- ilrd-paper: loops accepted by s_loop alone, as in the paper, `benchmarks/peers/paper_loops.py`;
+- paper: `--association paper`, all of the paper's steps as it writes them (`list3r/association/paper`);
+- frames: `--association frames`, the product's rule without any instance, by VGGT-Long's threshold and alignment;
+- ilrd-paper: loops accepted by s_loop alone, all else as `ilrd`;
 - verified: loops proposed by frame similarity and verified by geometry, no instance anywhere;
 - ilrd: + instances rank candidates and reject relations;
-- iasm-paper: instance-aware merging as in the paper, `benchmarks/peers/paper_support.py`: instances with a large
-  delta(o) are removed, and the support is sampled by confidence and coverage;
+- iasm-paper: instance-aware merging as in the paper: instances with a large delta(o) are removed, and the support is
+  sampled by confidence and coverage;
 - iasm: the instance-aware support of builds instead;
 - cwgo-paper: iasm with the paper's weights of edges in the graph;
 - graph: iasm with covariances as weights and switchable loops;
 - full: + nodes within chunks, as in builds;
 - full-no-instances: full with all instance evidence off (no `s_sem` and `s_rel`, no layout, no kinds, no registration
-  by objects): the difference of the two is the value of instances.
+  by objects), the same estimator on points whose instance labels are erased: the difference of the two is the value of
+  instances.
 """
 
 from __future__ import annotations
@@ -53,6 +56,8 @@ RETURNS = ("opposite", "night", "alike", "moved", "halls", "seasons")
 TITLES = {
     "vggt-long": "VGGT-Long as published",
     "vggt-long-cuts": "VGGT-Long, cuts given",
+    "paper": "the paper as written",
+    "frames": "frames alone (product)",
     "ilrd-paper": "loops by s_loop alone (paper)",
     "verified": "verified loops, no instances",
     "ilrd": "+ instances in loops (ILRD)",
@@ -186,27 +191,23 @@ def run_variants(
 
 def variant_settings(variant: str) -> Any:
     """Return the product's settings with the parts that a variant lacks switched off."""
-    from benchmarks.peers.graph_weights import PaperWeightSettings, PlainWeightSettings
-    from benchmarks.peers.paper_loops import PaperRevisitSettings
-    from benchmarks.peers.paper_support import PaperSupportSettings
-    from list3r.pipeline.settings import AssociationSettings
+    from list3r.association.graph.edge_information import WeightSettings
+    from list3r.pipeline.settings import ASSOCIATIONS, AssociationSettings
 
+    if variant in ASSOCIATIONS:
+        return AssociationSettings.by_method(variant)
     full = AssociationSettings()
-    plain_edges = replace(full.edges, instance_aware=False)
-    plain_graph = replace(full.graph, weights=PlainWeightSettings(), robust=False)
-    paper_weights = replace(full.graph, weights=PaperWeightSettings(), robust=False)
-    blind = variant in ("verified", "full-no-instances")
-    loops = _without_instances(full.revisits) if blind else full.revisits
+    methods = {"verified": "plain", "ilrd-paper": "plain", "ilrd": "plain", "iasm-paper": "paper"}
+    edges = replace(full.edges, method=methods.get(variant, "instances"))
+    loops = _without_instances(full.revisits) if variant in ("verified", "full-no-instances") else full.revisits
     if variant == "ilrd-paper":
-        loops = PaperRevisitSettings()
-    graph = {"cwgo-paper": paper_weights}.get(variant, plain_graph)
-    edges = full.edges if variant in ("iasm", "cwgo-paper", "graph", "full") else plain_edges
-    if variant == "iasm-paper":
-        edges = replace(full.edges, support=PaperSupportSettings())
+        loops = replace(loops, rule="score")
+    rule = "confidence" if variant == "cwgo-paper" else "equal"
+    simple = replace(full.graph, weights=WeightSettings(rule=rule), robust=False)
     return AssociationSettings(
         revisits=replace(loops, window=replace(loops.window, edges=edges)),
         edges=edges,
-        graph=full.graph if variant in ("graph", "full", "full-no-instances") else graph,
+        graph=full.graph if variant in ("graph", "full", "full-no-instances") else simple,
         nodes=full.nodes if variant.startswith("full") else replace(full.nodes, enabled=False),
     )
 
@@ -225,9 +226,6 @@ def _without_instances(revisits: Any) -> Any:
 
 def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, truth: _Truth) -> dict[str, Any]:
     """Build a memory of the chunks (placed only) and measure it."""
-    from benchmarks.peers.graph_weights import peer_weights
-    from benchmarks.peers.paper_loops import paper_loops
-    from benchmarks.peers.paper_support import paper_merging
     from list3r.association.overlap.motion import flag_dynamic
     from list3r.frames.base import Camera
     from list3r.memory.store.store import Store
@@ -245,16 +243,22 @@ def run_variant(variant: str, results: Sequence[Any], model: Any, joint: Any, tr
             _place_as_vggt_long(store, session, results, model.descriptors, joint)
         for result in () if peer else results:
             chunk = result
-            if settings.edges.instance_aware and variant != "iasm-paper":
+            if variant == "full-no-instances":
+                chunk = _unlabelled(chunk)
+            elif settings.edges.method == "instances":
                 height, width = result.image_size
                 camera = Camera(width, height, *result.intrinsics)
                 chunk = replace(result, library=flag_dynamic(result.samples, result.library, camera))
-            with paper_merging(), paper_loops(), peer_weights():
-                add_chunk(store, session, chunk, joint, settings, library=False)
+            add_chunk(store, session, chunk, joint, settings, library=False)
         if not peer:
-            with peer_weights():
-                finish_session(store, session, settings, library=False)
+            finish_session(store, session, settings, library=False)
         return truth.measure(store)
+
+
+def _unlabelled(chunk: Any) -> Any:
+    """A chunk whose points and library tell of no instance."""
+    samples = replace(chunk.samples, instance=np.full_like(chunk.samples.instance, -1))
+    return replace(chunk, samples=samples, library=replace(chunk.library, instances=()))
 
 
 def _place_as_vggt_long(store: Any, session: int, results: Sequence[Any], descriptors: Any, joint: Any) -> None:

@@ -13,7 +13,6 @@ import argparse
 import time
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 from machine import machine, write_json
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from benchmarks.feedforward_sim.feedforward import FeedForwardModel
-from benchmarks.peers.plain_alignment import plain_support
 from benchmarks.simulation.presets import make_video
 from benchmarks.simulation.video import SimulatedVideo
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings, measure_edge
@@ -117,10 +115,9 @@ def _fit(video: SimulatedVideo, chunk: ChunkResult) -> Sim3:
 def _plain(u: ChunkResult, v: ChunkResult) -> Sim3:
     height, width = v.image_size
     camera = Camera(width, height, *v.intrinsics)
-    settings = EdgeSettings(instance_aware=False)
+    settings = EdgeSettings(method="plain")
     try:
-        with patch("list3r.association.overlap.overlap_edge.align_support", plain_support):
-            return measure_edge(EdgeEnd(1, u.samples), EdgeEnd(2, v.samples), camera, False, settings).edge.S_v_u
+        return measure_edge(EdgeEnd(1, u.samples), EdgeEnd(2, v.samples), camera, False, settings).edge.S_v_u
     except DegenerateError:
         return Sim3.identity()
 

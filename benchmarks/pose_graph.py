@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from benchmarks.peers.graph_weights import PlainWeightSettings, peer_weights
 from list3r.association.graph.edge_information import WeightSettings, information_of
 from list3r.association.graph.incremental import extend
 from list3r.association.graph.marginals import marginals
@@ -298,8 +297,7 @@ def false_loops(chunks: int, edges: int, seed: int, alike: bool, drift: float = 
         return ate(stack([result.S_graph_chunk[k] for k in ids]), clean.truth)
 
     without, (with_false, seconds) = placed(solved(clean)), timed(lambda: solved(spoilt), 1)
-    with peer_weights():
-        plain = solved(spoilt, GraphSettings(weights=PlainWeightSettings(), robust=False))
+    plain = solved(spoilt, GraphSettings(weights=WeightSettings(rule="equal"), robust=False))
     believed = np.array([e.accepted for e in with_false.edges])
     start = chained(spoilt.edges, first[0])
     row = {

@@ -46,9 +46,9 @@ def pair(things: tuple[Thing, ...] = BOXES, noise: float = 0.005, **kwargs: floa
     return u, film(things, S_V, noise=noise, seed=2, mover_depth=kwargs.get("depth_v", 1.0))
 
 
-@pytest.mark.parametrize("aware", [True, False])
-def test_a_similarity_is_recovered(aware: bool) -> None:
-    measured = edge_between(*pair(noise=0.0), 3, 4, CAMERA, False, EdgeSettings(instance_aware=aware))
+@pytest.mark.parametrize("method", ["instances", "plain", "paper"])
+def test_a_similarity_is_recovered(method: str) -> None:
+    measured = edge_between(*pair(noise=0.0), 3, 4, CAMERA, False, EdgeSettings(method=method))
     edge = measured.edge
     assert (edge.u, edge.v, edge.kind, edge.accepted, edge.frames) == (3, 4, "adjacent", True, None)
     assert off(edge.S_v_u) < 1e-4
@@ -83,7 +83,7 @@ def test_a_mover_over_half_of_the_picture_is_left_out(depth_u: float, depth_v: f
     assert measured.support.removed.mean() > 0.4
     assert "move" in measured.edge.reason
     assert off(measured.edge.S_v_u) < 0.015
-    plain = edge_between(u, v, 0, 1, CAMERA, False, EdgeSettings(instance_aware=False))
+    plain = edge_between(u, v, 0, 1, CAMERA, False, EdgeSettings(method="plain"))
     assert off(measured.edge.S_v_u) <= off(plain.edge.S_v_u) + 0.005
 
 
@@ -166,9 +166,9 @@ def test_degenerate_overlap_has_a_name() -> None:
         "at least 60": (only(u, u.frame == 0), only(v, (v.frame == 0) & (v.pixel < 2000))),
     }
     for reason, (a, b) in cases.items():
-        for aware in (True, False):
+        for method in ("instances", "plain"):
             with pytest.raises(DegenerateError, match=f"chunks 7 and 8 cannot be aligned.*{reason}"):
-                edge_between(a, b, 7, 8, CAMERA, False, EdgeSettings(instance_aware=aware))
+                edge_between(a, b, 7, 8, CAMERA, False, EdgeSettings(method=method))
     with pytest.raises(DegenerateError):
         edge_between(FrameSamples.empty(), FrameSamples.empty(), 7, 8, CAMERA, False)
     with pytest.raises(DegenerateError, match="static"):

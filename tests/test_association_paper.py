@@ -6,14 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.peers.graph_weights import PaperWeightSettings, edge_weights
-from benchmarks.peers.paper_loops import PaperRevisitSettings
 from benchmarks.peers.point_maps import coverage_rank
 from list3r.association.graph.pose_graph import chain_poses
 from list3r.association.overlap.alignment import AlignmentSettings, align
 from list3r.association.overlap.inconsistency import displacement, inconsistency
 from list3r.association.overlap.regions import EdgeSupportSettings, Regions, confident
 from list3r.association.overlap.shared_points import Pairs
+from list3r.association.paper.weights import paper_weights
 from list3r.association.revisits.instance_similarity import (
     InstanceSet,
     InstanceSimilarity,
@@ -21,20 +20,31 @@ from list3r.association.revisits.instance_similarity import (
     loop_score,
 )
 from list3r.frames.base import Camera
+from list3r.memory.core.errors import OptionError
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import Edge
+from list3r.memory.core.settings import as_plain, from_plain
+from list3r.pipeline.settings import ASSOCIATIONS, AssociationSettings
 
 
 def test_s_loop_weighs_frames_against_instances() -> None:
     cues = InstanceSimilarity(s_sem=0.9, s_rel=0.6, pairs=((1, 1),), log_scale=0.0)
-    settings = PaperRevisitSettings()
-    assert (settings.lambda_, settings.least_score) == (0.5, 0.7)
+    settings = AssociationSettings.by_method("paper").revisits
+    assert (settings.lambda_, settings.rule) == (0.5, "score")
     assert loop_score(0.8, cues, settings.lambda_) == pytest.approx(1.15)  # 0.5 * 0.8 + 0.5 * (0.9 + 0.6)
     assert loop_score(0.8, cues, 1.0) == pytest.approx(0.8)
     assert loop_score(0.8, cues, 0.0) == pytest.approx(1.5)
-    # frames alike at 0.85 and no instance that matches stay below the threshold; two cues of 0.3 pass it
-    assert loop_score(0.85, InstanceSimilarity(0.0, 0.0, (), float("nan")), 0.5) < settings.least_score
-    assert loop_score(0.85, InstanceSimilarity(0.3, 0.3, (), 0.0), 0.5) > settings.least_score
+    # frames that are the same and no instance that matches stay below the threshold
+    assert loop_score(1.0, InstanceSimilarity(0.0, 0.0, (), float("nan")), 0.5) < settings.least_score
+    assert loop_score(0.95, InstanceSimilarity(0.9, 0.9, (), 0.0), 0.5) > settings.least_score
+
+
+def test_the_methods_of_association_are_stored_with_a_session() -> None:
+    for method in ASSOCIATIONS:
+        settings = AssociationSettings.by_method(method)
+        assert from_plain(AssociationSettings, as_plain(settings)) == settings
+    with pytest.raises(OptionError, match="--association slam: choose from list3r, paper, frames"):
+        AssociationSettings.by_method("slam")
 
 
 def test_s_sem_is_the_mean_cosine_of_mutual_nearest_neighbours() -> None:
@@ -55,7 +65,7 @@ def _set(looks: np.ndarray) -> InstanceSet:
 def test_weights_of_edges_are_the_papers() -> None:
     # m = 1: log(1.3) = 0.262364, u = 0.207836, u^6 = 8.0598e-5, (1 - u)^6 = 0.247110, weight 3.2606e-4
     # m = 0.25: log(1.075) = 0.072321, u = 0.067443, u^6 = 9.4110e-8, (1 - u)^6 = 0.657642, weight 1.4310e-7
-    weights = edge_weights(np.array([1.0, 0.25]), PaperWeightSettings())
+    weights = paper_weights(np.array([1.0, 0.25]))
     assert weights[0] == 1.0
     assert weights[1] == pytest.approx(1.4310e-7 / 3.2606e-4, rel=1e-3)
     assert 1 / weights[1] == pytest.approx(2278, rel=2e-3)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.peers.graph_weights import PlainWeightSettings, peer_weights
 from list3r.association.graph.block_cholesky import BlockFactor, BlockPattern, NotPositiveError
 from list3r.association.graph.edge_information import WeightSettings, support_of
 from list3r.association.graph.edge_trust import Tree, chain_squares
@@ -232,8 +231,7 @@ def test_a_wrong_adjacent_edge_yields_to_many_loops() -> None:
     assert sum(not e.accepted for e in result.edges) <= 2
     errors = [np.linalg.norm(result.S_graph_chunk[k].translation - truth[k].translation) for k in range(40)]
     assert max(errors) < 0.5
-    with peer_weights():
-        plain = solved(truth, edges, GraphSettings(weights=PlainWeightSettings(), robust=False))
+    plain = solved(truth, edges, GraphSettings(weights=WeightSettings(rule="equal"), robust=False))
     assert all(e.accepted for e in plain.edges)
 
 

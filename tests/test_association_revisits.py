@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.peers.paper_loops import PaperRevisitSettings, loops_by_score
+from list3r.association.paper.loops import loops_by_score
 from list3r.association.revisits.frame_search import TRAINED, SearchSettings, choose
 from list3r.association.revisits.scaled_verification import _fit, _similarities, verify_scaled
 from list3r.association.revisits.search import RevisitSettings, find_loops
@@ -302,7 +302,7 @@ def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyf
     memory = Chunks([(here,), (), (less,)])
     for edges, refused in (
         (find_loops(memory, 2), False),
-        (loops_by_score(memory, 2, None, PaperRevisitSettings()), True),
+        (loops_by_score(memory, 2, None, RevisitSettings(rule="score")), True),
     ):
         assert len(edges) == 1 and edges[0].scores["s_det"] < 0.85
         assert ("not alike enough" in edges[0].reason) is refused

@@ -18,7 +18,7 @@ from list3r.models.device import find_gpu, pictures_that_fit
 from list3r.models.licences import terms
 from list3r.models.presets import ModelSelection, select
 from list3r.pipeline.request import BuildRequest
-from list3r.pipeline.settings import BuildSettings, session_settings
+from list3r.pipeline.settings import AssociationSettings, BuildSettings, session_settings
 from list3r.reconstruction.precomputed_files import read_manifest
 from list3r.reconstruction.registry import MODELS, entry
 
@@ -51,7 +51,8 @@ def settings_asked(request: BuildRequest, info: SourceInfo, licence: str) -> tup
     """
     settings, notes = _models_asked(request, info, licence)
     chunks = _cut(settings, request.chunk, request.overlap)
-    return replace(settings, chunks=chunks, depth_every=request.depth_every, up=_up_asked(request, settings.up)), notes
+    settings = replace(settings, chunks=chunks, depth_every=request.depth_every, up=_up_asked(request, settings.up))
+    return replace(settings, association=AssociationSettings.by_method(request.association or "list3r")), notes
 
 
 def settings_resumed(
@@ -75,6 +76,8 @@ def settings_resumed(
             f"this session was begun with --discovery {settings.discovery}, which this version does not have; "
             "continue with --discovery learned"
         )
+    if request.association is not None:
+        settings = replace(settings, association=AssociationSettings.by_method(request.association))
     if request.chunk is not None or request.overlap is not None:
         settings = replace(settings, chunks=_cut(settings, request.chunk, request.overlap))
     return settings, notes

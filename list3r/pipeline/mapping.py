@@ -11,6 +11,7 @@ from pathlib import Path
 from list3r.association.overlap.camera_edge import better_edge, camera_edge, in_one_frame, one_frame_edge
 from list3r.association.overlap.overlap_edge import EdgeEnd, measure_edge
 from list3r.association.overlap.prior_edge import prior_edge
+from list3r.association.paper.loops import loops_by_score
 from list3r.association.revisits.joint_window import JointReconstructor
 from list3r.association.revisits.loop_overlay import write_loop
 from list3r.association.revisits.reprojection_edge import ReprojectionSettings, refine_loop
@@ -88,7 +89,8 @@ def _relate(
         given = any(in_one_frame(e) for e in adjacent)
         store.edges.add([] if given else _prior_edge(store, session_id, result, how))
     if not given or len(store.sessions.all()) > 1:
-        loops = find_loops(store, chunk_id, joint, how.revisits)
+        by_score = how.revisits.rule == "score"
+        loops = (loops_by_score if by_score else find_loops)(store, chunk_id, joint, how.revisits)
         store.edges.add(_refined(store, e, how.reprojection) if e.accepted else e for e in loops)
 
 

@@ -100,6 +100,14 @@ class BuildRequest:
             "camera|x,y,z|unknown",
         ),
     )
+    association: str | None = field(
+        default=None,
+        metadata=option(
+            "How chunks are joined: list3r; paper (the paper's steps as written); frames (no instances, VGGT-Long's "
+            "rule). For comparison on your own video.",
+            "list3r|paper|frames",
+        ),
+    )
     chunk: int | None = field(
         default=None, metadata=option("Frames in a chunk; default: 100, with a network as many as the GPU holds.", "N")
     )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from list3r.association.graph.chunk_nodes import NodeSettings
+from list3r.association.graph.edge_information import WeightSettings
 from list3r.association.graph.pose_graph import GraphSettings
 from list3r.association.graph.surface_graph import SurfaceSettings
 from list3r.association.overlap.camera_edge import CameraEdgeSettings
@@ -22,11 +23,13 @@ from list3r.frames.chunking.cuts import ShotCutSettings
 from list3r.frames.chunking.pace import PaceSettings
 from list3r.instances.carving.carved_surfaces import ChangedPlaceSettings
 from list3r.instances.settings import InstanceSettings
-from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.errors import MemoryFileError, OptionError
 from list3r.memory.core.records import Session
 from list3r.memory.core.settings import as_plain, from_plain
 from list3r.memory.library.rules import ConsolidationSettings
 from list3r.reconstruction.settings import ReconstructionSettings
+
+ASSOCIATIONS = ("list3r", "paper", "frames")
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,29 @@ class AssociationSettings:
     """Where up is not known yet it is asked again after so many chunks."""
     guess_metre: bool = True
     """Where nobody knows lengths, a metre is guessed at the end of a session."""
+
+    @classmethod
+    def by_method(cls, method: str) -> AssociationSettings:
+        """Return ours ("list3r"), the paper's steps as it writes them ("paper"), or frames alone with VGGT-Long's
+        threshold, alignment and equal weights ("frames").
+
+        Raises `OptionError`.
+        """
+        ours = cls()
+        if method == "list3r":
+            return ours
+        if method not in ASSOCIATIONS:
+            raise OptionError(f"--association {method}: choose from {', '.join(ASSOCIATIONS)}")
+        paper = method == "paper"
+        edges = replace(ours.edges, method="paper" if paper else "plain")
+        loops = replace(ours.revisits, rule="score", window=replace(ours.revisits.window, edges=edges))
+        return replace(
+            ours,
+            revisits=loops if paper else replace(loops, lambda_=1.0, least_score=0.85),
+            edges=edges,
+            graph=replace(ours.graph, robust=False, weights=WeightSettings(rule="confidence" if paper else "equal")),
+            nodes=replace(ours.nodes, enabled=False),
+        )
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def commit(name: str) -> str:
-    """Return the commit at which a result was measured; older results name only the one that brought their file."""
+    """Return the commit at which a result was measured, with + where files were changed; older results name only the
+    one that brought their file."""
     result = read(name)
-    measured = result.get("commit")
-    return str(measured).rstrip("+")[:7] if measured else f"{result['commit_of_file']}, file"
+    measured = str(result.get("commit", ""))
+    return measured[:7] + "+" * measured.endswith("+") if measured else f"{result['commit_of_file']}, file"
 
 
 def elsewhere() -> list[tuple[str, dict[str, Any], str]]:

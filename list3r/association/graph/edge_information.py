@@ -1,7 +1,6 @@
 """The information matrix of each edge of the graph, from its covariance and the deformation of chunks.
 
-The paper weighs edges by their confidence instead (A.4): `benchmarks/peers/graph_weights.py`, research/association
-0041.
+The paper weighs edges by their confidence instead (A.4), VGGT-Long weighs all alike: `WeightSettings.rule`.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.graph.solver import adjoint
+from list3r.association.paper.weights import paper_weights
 from list3r.memory.core.geometry import skew, stack
 from list3r.memory.core.records import Edge
 
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 class WeightSettings:
     """How edges are weighted."""
 
+    rule: str = "covariance"
+    """covariance (what an edge states, and deformation), confidence (the paper's w_uv times the identity), or equal."""
     lever_m: float = 1.0
     """Distance at which a rotation weighs as much as a shift where an edge has no lever, metres; without metric scale
     half the spread of its points replaces it."""
@@ -44,6 +46,11 @@ def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings
 
     Shape (E, D, D), D = 6 if metric else 7.
     """
+    if settings.rule != "covariance":
+        equal = _equal_information(edges, metric, settings)
+        if settings.rule == "equal":
+            return equal
+        return equal * np.maximum(paper_weights(np.array([e.confidence for e in edges])), 1e-6)[:, None, None]
     size = 6 if metric else 7
     covariance = np.empty((len(edges), 7, 7))
     measured = np.array([e.covariance is not None for e in edges], bool)
@@ -81,6 +88,14 @@ def lever_of(edge: Edge, metric: bool, settings: WeightSettings) -> float | None
     if metric or "spread" not in edge.scores:
         return settings.lever_m if metric else None
     return max(0.5 * edge.scores["spread"] / float(edge.S_v_u.scale), 1e-9)
+
+
+def _equal_information(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
+    """Return the same information for every edge, angles and shifts in one unit. Shape (E, D, D)."""
+    levers = [lever for e in edges if (lever := lever_of(e, metric, settings)) is not None]
+    lever = float(np.median(levers)) if levers else settings.lever_m
+    unit = np.array([lever] * 3 + [1.0] * (3 if metric else 4)) * settings.unmeasured
+    return np.tile(np.diag(1.0 / unit**2), (len(edges), 1, 1))
 
 
 def _unmeasured(edge: Edge, metric: bool, settings: WeightSettings) -> Array:

@@ -17,6 +17,8 @@ from list3r.association.overlap.balance import BalancedSupport, balanced_support
 from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confident
 from list3r.association.overlap.shared_points import Pairs, shared_pairs
 from list3r.association.overlap.support import Fit, StaticSupport, static_support
+from list3r.association.paper.plain_alignment import plain_align
+from list3r.association.paper.support import PaperSupportSettings, sampled, without_large_delta
 from list3r.frames.base import Camera
 from list3r.memory.core.errors import DegenerateError
 from list3r.memory.core.geometry import Sim3
@@ -27,8 +29,9 @@ from list3r.memory.core.records import Edge, FrameSamples
 class EdgeSettings:
     """How an edge is measured."""
 
-    instance_aware: bool = True
-    """Whether moving regions leave the support; otherwise all pairs with enough confidence are used."""
+    method: str = "instances"
+    """instances (moving regions leave the support), paper (its support and alignment), or plain (VGGT-Long: all pairs
+    with enough confidence)."""
     least_pairs: int = 60
     """Fewest pairs of an edge."""
     least_inliers: float = 0.3
@@ -39,6 +42,8 @@ class EdgeSettings:
     """Pairs of a trial alignment."""
     support: EdgeSupportSettings = field(default_factory=EdgeSupportSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
+    paper: PaperSupportSettings = field(default_factory=PaperSupportSettings)
+    """Of the method paper."""
 
 
 @dataclass(frozen=True)
@@ -114,24 +119,25 @@ def _aligned(
     pairs: Pairs, known: Mask, camera: Camera, metric: bool, settings: EdgeSettings
 ) -> tuple[StaticSupport, BalancedSupport, Alignment]:
     """Choose the support of an edge and align it; without instances where they leave too little."""
-    if settings.instance_aware:
-        static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
-        support = balanced_support(pairs, static, camera, settings.support)
-    else:
+    if settings.method != "instances":
         static, support = _confident_support(pairs, settings.support)
+        if settings.method == "paper":
+            static = without_large_delta(pairs, camera, settings.support, settings.paper)
+            support = sampled(pairs, static, settings.paper)
+        return static, support, plain_align(support.p_u, support.p_v, support.weight, support.frame, metric)
+    static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
+    support = balanced_support(pairs, static, camera, settings.support)
     try:
-        found = align_support(support, metric, settings)
+        found = _align(support, metric, settings)
     except DegenerateError:
-        if not settings.instance_aware or not static.removed.any():
+        if not static.removed.any():
             raise
         static, support = _confident_support(pairs, settings.support)
-        found = align_support(support, metric, settings)
+        found = _align(support, metric, settings)
     return static, support, found
 
 
-def align_support(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
-    """Align the support of an edge. `benchmarks/association.py` replaces it by a plain alignment."""
-    s = support
+def _align(s: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
     return align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment)
 
 

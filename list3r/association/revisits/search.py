@@ -8,7 +8,7 @@
 4. A relation that the chain of accepted edges contradicts is refused (`chain`).
 
 Every candidate becomes an edge, accepted or not, with its scores and the reason. The choice of the weights:
-research/association 0045. `benchmarks/peers/paper_loops.py` accepts loops by s_loop alone, as in the paper.
+research/association 0045. `association/paper/loops.py` accepts loops by s_loop alone, as in the paper.
 """
 
 from __future__ import annotations
@@ -67,6 +67,11 @@ class RevisitSettings:
     lambda_: float = 0.5
     """Weight of frame similarity in s_loop (the paper gives none), which ranks candidates (research/association
     0149)."""
+    rule: str = "geometry"
+    """What accepts a loop: geometry, or score (s_loop alone)."""
+    least_score: float = 1.3
+    """Of the rule score: least s_loop. The paper gives none; of 0.9 to 1.3 this one has the least error on the seeds 1 to
+    3 of `benchmarks/association.py`, which no table holds."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
     enough: int = 8

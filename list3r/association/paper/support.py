@@ -1,4 +1,4 @@
-"""Instance-aware merging as in the paper (sections 3.2, A.3 and A.4), for a row of `benchmarks/association.py`.
+"""Instance-aware merging as in the paper (sections 3.2, A.3 and A.4).
 
 All confident pairs give a first transformation; instances with a large delta(o) are removed; from the rest the support
 is sampled by confidence and coverage, and aligned with confidences as weights. The paper gives no number for "large",
@@ -7,31 +7,23 @@ for the cells or for the size of the sample; those here are ours, and marked so.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.peers.plain_alignment import plain_align, plain_support
-from list3r.association.overlap.alignment import Alignment
-from list3r.association.overlap.balance import BalancedSupport, balanced_support
+from list3r.association.overlap.balance import BalancedSupport
 from list3r.association.overlap.inconsistency import displacement
-from list3r.association.overlap.overlap_edge import EdgeSettings
-from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confident
+from list3r.association.overlap.regions import EdgeSupportSettings, confident
 from list3r.association.overlap.shared_points import Pairs
-from list3r.association.overlap.support import Fit, StaticSupport, static_support
+from list3r.association.overlap.support import StaticSupport
+from list3r.association.paper.plain_alignment import plain_align
 from list3r.frames.base import Camera
 from list3r.memory.core.errors import DegenerateError
 
-SIGMA_R = 0.02
-"""Of the confidence m_uv, as a share of the spread of the points; the paper gives none."""
-
 
 @dataclass(frozen=True)
-class PaperSupportSettings(EdgeSupportSettings):
-    """Settings under which edges are measured as the paper writes it."""
+class PaperSupportSettings:
+    """What the paper leaves open in its support of an edge."""
 
     large: float = 3.0
     """An instance leaves when its delta(o) is larger than so many times the median of all instances' ..."""
@@ -41,31 +33,21 @@ class PaperSupportSettings(EdgeSupportSettings):
     """Most pairs that are aligned."""
 
 
-@contextmanager
-def paper_merging() -> Iterator[None]:
-    """Let edges with `PaperSupportSettings` be measured as the paper writes it, and all others as they are."""
-    edges = "list3r.association.overlap.overlap_edge"
-    with ExitStack() as stack:
-        for name, function in (("static_support", _static), ("balanced_support", _sampled), ("align_support", _align)):
-            stack.enter_context(patch(f"{edges}.{name}", function))
-        yield
-
-
-def without_large_delta(pairs: Pairs, camera: Camera, settings: PaperSupportSettings) -> StaticSupport:
+def without_large_delta(
+    pairs: Pairs, camera: Camera, regions: EdgeSupportSettings, settings: PaperSupportSettings
+) -> StaticSupport:
     """Leave out the instances with a large delta(o), by the masks of u. Raises `DegenerateError`."""
-    sure = confident(pairs, settings)
+    sure = confident(pairs, regions)
     if not sure.any():
         raise DegenerateError("no shared point has enough confidence in both chunks")
     none = np.zeros(len(pairs), bool)
-    T_uv = plain_align(
-        pairs.p_u[sure], pairs.p_v[sure], pairs.weight[sure], pairs.frame[sure], metric=False, residual_scale=SIGMA_R
-    ).S_v_u
+    T_uv = plain_align(pairs.p_u[sure], pairs.p_v[sure], pairs.weight[sure], pairs.frame[sure], metric=False).S_v_u
     off_px = displacement(pairs, T_uv, camera, sure, none).delta_px
     ids, of_pair, count = np.unique(pairs.instance_u[sure], return_inverse=True, return_counts=True)
     delta = np.bincount(of_pair.ravel(), off_px[sure]) / count
-    judged = (ids >= 0) & (count >= settings.least_region_pairs)
+    judged = (ids >= 0) & (count >= regions.least_region_pairs)
     limit = (
-        max(settings.large * float(np.median(delta[judged])), settings.least_pixels * camera.width)
+        max(settings.large * float(np.median(delta[judged])), regions.least_pixels * camera.width)
         if judged.any()
         else 0.0
     )
@@ -110,24 +92,3 @@ def coverage_turn(points: np.ndarray, instance: np.ndarray, weight: np.ndarray, 
     turn = np.empty(len(points), np.int64)
     turn[order] = np.arange(len(points)) - np.repeat(first, np.diff([*first, len(points)]))
     return turn
-
-
-def _static(
-    pairs: Pairs, camera: Camera, fit: Fit, settings: EdgeSupportSettings, known: Mask | None = None
-) -> StaticSupport:
-    if isinstance(settings, PaperSupportSettings):
-        return without_large_delta(pairs, camera, settings)
-    return static_support(pairs, camera, fit, settings, known)
-
-
-def _sampled(pairs: Pairs, static: StaticSupport, camera: Camera, settings: EdgeSupportSettings) -> BalancedSupport:
-    if isinstance(settings, PaperSupportSettings):
-        return sampled(pairs, static, settings)
-    return balanced_support(pairs, static, camera, settings)
-
-
-def _align(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
-    if isinstance(settings.support, PaperSupportSettings):
-        s = support
-        return plain_align(s.p_u, s.p_v, s.weight, s.frame, metric, SIGMA_R)
-    return plain_support(support, metric, settings)

@@ -5,22 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.peers.paper_support import (
-    PaperSupportSettings,
-    coverage_turn,
-    paper_merging,
-    sampled,
-    without_large_delta,
-)
 from list3r.association.overlap import overlap_edge
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings
+from list3r.association.overlap.regions import EdgeSupportSettings
 from list3r.association.overlap.shared_points import Pairs
+from list3r.association.paper.support import PaperSupportSettings, coverage_turn, sampled, without_large_delta
 from list3r.frames.base import Camera
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import FrameSamples
 
 CAMERA = Camera(100, 80, 100.0, 100.0, 50.0, 40.0)
-SETTINGS = PaperSupportSettings()
+SETTINGS, REGIONS = PaperSupportSettings(), EdgeSupportSettings()
 
 
 def _pairs(p_u: np.ndarray, p_v: np.ndarray, instance: np.ndarray, confidence: np.ndarray | None = None) -> Pairs:
@@ -42,10 +37,10 @@ def test_an_instance_leaves_where_its_delta_is_large() -> None:
     p_v = p_u.copy()
     p_v[400:, 0] += 0.2
     thing = np.repeat(np.arange(5), 100)
-    found = without_large_delta(_pairs(p_u, p_v, thing), CAMERA, SETTINGS)
+    found = without_large_delta(_pairs(p_u, p_v, thing), CAMERA, REGIONS, SETTINGS)
     assert found.left_out_u == {4} and found.removed.tolist() == (thing == 4).tolist()
     assert 0.5 < found.delta_max_px < 2.0
-    still = without_large_delta(_pairs(p_u, p_u, thing), CAMERA, SETTINGS)
+    still = without_large_delta(_pairs(p_u, p_u, thing), CAMERA, REGIONS, SETTINGS)
     assert not still.removed.any() and still.delta_max_px == pytest.approx(0.0, abs=1e-6)
 
 
@@ -54,7 +49,7 @@ def test_what_has_no_instance_never_leaves() -> None:
     p_u = _grid(rng, 300)
     p_v = p_u.copy()
     p_v[200:, 0] += 0.5
-    found = without_large_delta(_pairs(p_u, p_v, np.full(300, -1)), CAMERA, SETTINGS)
+    found = without_large_delta(_pairs(p_u, p_v, np.full(300, -1)), CAMERA, REGIONS, SETTINGS)
     assert not found.removed.any()
 
 
@@ -67,7 +62,7 @@ def test_cells_and_instances_are_sampled_in_turn_the_surest_first() -> None:
     assert turn.tolist() == [1, 0, 2, 3, 1, 0, 0]
     few = PaperSupportSettings(sample=3)
     pairs = _pairs(points, points, thing, weight)
-    chosen = sampled(pairs, without_large_delta(pairs, CAMERA, few), few)
+    chosen = sampled(pairs, without_large_delta(pairs, CAMERA, REGIONS, few), few)
     assert chosen.used.tolist() == [False, True, False, False, False, True, True]
     assert chosen.weight == pytest.approx([0.9, 0.3, 0.1])
 
@@ -79,14 +74,10 @@ def test_an_edge_is_measured_so_where_its_settings_say_it() -> None:
     pixel = np.arange(600, dtype=np.int32)
     u = FrameSamples(*_samples(p, pixel))
     v = FrameSamples(*_samples(truth.apply(p), pixel))
-    as_written = EdgeSettings(support=SETTINGS)
-    with paper_merging():
-        found = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False, as_written).edge
-        ours = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False).edge
+    as_written = EdgeSettings(method="paper")
+    found = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False, as_written).edge
     assert np.allclose(found.S_v_u.as_matrix(), truth.as_matrix(), atol=1e-5)
     assert found.confidence == pytest.approx(1.0, abs=1e-4)
-    plain = overlap_edge.measure_edge(EdgeEnd(1, u), EdgeEnd(2, v), CAMERA, False).edge
-    assert np.array_equal(ours.S_v_u.as_matrix(), plain.S_v_u.as_matrix())
 
 
 def _samples(points: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -1,4 +1,4 @@
-"""The alignment of VGGT-Long as rows of `benchmarks/association.py` use it: a fixed kernel, scale by ratio of spreads.
+"""The alignment of VGGT-Long, which the paper builds on: a fixed kernel, scale by ratio of spreads.
 
 After the description of its settings: Huber kernel of 0.1, five rounds of re-weighting, scale the ratio of the weighted
 RMS radii, rotation by SVD with the determinant fixed (Umeyama 1991).
@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.alignment import Alignment
 from list3r.association.overlap.alignment_covariance import FittedPairs, measure_uncertainty
-from list3r.association.overlap.balance import BalancedSupport
-from list3r.association.overlap.overlap_edge import EdgeSettings, align_support
 from list3r.memory.core.errors import DegenerateError
 from list3r.memory.core.geometry import Sim3
 
@@ -21,23 +19,15 @@ Array = NDArray[np.float64]
 HUBER = 0.1
 """Limit of the quadratic part of the kernel, units of v."""
 ROUNDS = 5
+SIGMA_R = 0.02
+"""Residual at which a pair counts 1/e in m_uv, as a share of the spread of the points; the paper gives none."""
 
 
-def plain_support(support: BalancedSupport, metric: bool, settings: EdgeSettings) -> Alignment:
-    """Align the support of an edge: plainly where settings leave instances out, else as in builds."""
-    if settings.instance_aware:
-        return align_support(support, metric, settings)
-    s = support
-    return plain_align(s.p_u, s.p_v, s.weight, s.frame, metric, settings.alignment.residual_scale)
-
-
-def plain_align(
-    p_u: Array, p_v: Array, weight: Array, group: NDArray[np.int64], metric: bool, residual_scale: float
-) -> Alignment:
+def plain_align(p_u: Array, p_v: Array, weight: Array, group: NDArray[np.int64], metric: bool) -> Alignment:
     """The alignment of pairs (N, 3) with weights (N,) of frames (N,).
 
-    Its covariance is that of a robust fit to the pairs within three robust deviations. `residual_scale` is sigma_r as
-    a share of the spread of v. Raises `DegenerateError` when the pairs have no weight or no extent.
+    Its covariance is that of a robust fit to the pairs within three robust deviations. Raises `DegenerateError` when
+    the pairs have no weight or no extent.
     """
     S_v_u = _ratio_of_radii(p_u, p_v, weight, metric)
     for _ in range(ROUNDS):
@@ -46,7 +36,7 @@ def plain_align(
     residual = np.linalg.norm(S_v_u.apply(p_u) - p_v, axis=1)
     low, high = np.quantile(p_v, [0.05, 0.95], axis=0)
     spread = float(np.linalg.norm(high - low))
-    sigma, share = residual_scale * spread, weight / weight.sum()
+    sigma, share = SIGMA_R * spread, weight / weight.sum()
     inside = residual < 3 * sigma
     return Alignment(
         S_v_u=S_v_u,
