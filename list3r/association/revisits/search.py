@@ -70,8 +70,8 @@ class RevisitSettings:
     rule: str = "geometry"
     """What accepts a loop: geometry, or score (s_loop alone)."""
     least_score: float = 1.3
-    """Of the rule score: least s_loop. The paper gives none; of 0.9 to 1.3 this one has the least error on the seeds 1 to
-    3 of `benchmarks/association.py`, which no table holds."""
+    """Of the rule score: least s_loop. The paper gives none; of 0.9 to 1.3 this one has the least error on the seeds
+    1 to 3 of `benchmarks/association.py`, which no table holds."""
     verify: int = 14
     """Most candidates of a chunk that are verified."""
     enough: int = 8
