@@ -113,6 +113,26 @@ def test_a_cut_to_another_place_leaves_the_larger_part(frames: list[Frame], trut
     assert shift.max() < 0.01
 
 
+def test_each_stretch_between_cuts_is_a_part_in_order_of_time(frames: list[Frame], truth: np.ndarray) -> None:
+    other = frames_along(walk(15), seed=7, boxes=(((-0.5, -0.4, 1.2), (0.1, 0.3, 1.7)),))
+    bare = black(frames[0])
+    cut = [*other[:10], bare, *frames[:25]]
+    cut = [replace(f, index=k, time_s=k / 30) for k, f in enumerate(cut)]
+    first, last = RgbdReconstructor().parts(cut, CAMERA)
+    assert first.frame_indices.tolist() == list(range(10)) and first.posed.all()
+    assert last.frame_indices.tolist() == list(range(10, 36)) and last.posed[1:].all() and not last.posed[0]
+    assert last.frame_indices[last.keyframes[0]] == 11
+    for part, poses in ((first, walk(15)[:10]), (last, truth[:25])):
+        shift, _ = pose_errors(part.T_chunk_cam[part.posed], poses)
+        assert shift.max() < 0.01
+
+
+def test_a_video_without_a_cut_is_one_part(frames: list[Frame]) -> None:
+    (part,) = RgbdReconstructor().parts(frames[:12], CAMERA, deep=range(0, 12, 2))
+    whole = RgbdReconstructor().thinned(frames[:12], CAMERA, range(0, 12, 2))
+    assert np.array_equal(part.T_chunk_cam, whole.T_chunk_cam) and part.between is not None
+
+
 def test_a_slow_video_is_followed() -> None:
     poses = walk(10, speed=15.0)
     result = RgbdReconstructor()(frames_along(poses, step_s=0.5), CAMERA)
