@@ -37,6 +37,7 @@ from list3r.simulation.worlds.materials import Material
 from list3r.simulation.worlds.world import SimulatedWorld
 
 FPS = 15.0
+SIZE = (240, 180)
 LEAST_THINGS = 0.05
 """Share of a picture from which on it shows structure."""
 FAINT = 5
@@ -49,7 +50,9 @@ class PlainWalk(WalkSettings):
     def world(self) -> SimulatedWorld:
         """Return the rooms."""
         world = super().world()
-        bare = [replace(o, parts=tuple(replace(p, material=_plain(p.material)) for p in o.parts)) for o in world.objects]
+        bare = [
+            replace(o, parts=tuple(replace(p, material=_plain(p.material)) for p in o.parts)) for o in world.objects
+        ]
         return replace(world, objects=tuple(bare))
 
 
@@ -79,19 +82,19 @@ class BareWalk(PlainWalk):
 
 
 WALKS = (
-    BareWalk(seed=11, wall=10),
-    BareWalk(seed=12, wall=20, onward=40),
+    BareWalk(seed=11, wall=10, onward=25),
+    BareWalk(seed=12, wall=20, onward=25),
     BareWalk(seed=13, wall=40),
-    BareWalk(seed=14, wall=40, onward=40),
+    BareWalk(seed=14, wall=40, onward=25),
     BareWalk(seed=15, wall=60),
-    BareWalk(seed=16, wall=60, onward=60),
+    BareWalk(seed=16, wall=60, onward=25),
 )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=140, help="of each walk without its wall")
-    parser.add_argument("--walks", default="0,1,2,3,4,5", help="numbers of those that are filmed")
+    parser.add_argument("--frames", type=int, default=90, help="of each walk without its wall")
+    parser.add_argument("--walks", default="1,2,3,5", help="numbers of those that are filmed")
     parser.add_argument("--keep", type=Path, help="folder in which the films are kept")
     parser.add_argument("--colour", action="store_true", help="without depth, by structure from motion")
     parser.add_argument("--json", type=Path)
@@ -99,11 +102,13 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         for number in map(int, words.walks.split(",")):
-            walk = replace(WALKS[number], frames=words.frames, path=PathSettings(fps=FPS, speed_m_s=0.35))
+            walk = replace(WALKS[number], frames=words.frames, size=SIZE, path=PathSettings(fps=FPS, speed_m_s=0.35))
             folder = (words.keep or Path(scratch)) / f"walk-{number}"
             if not (folder / "truth.json").exists():
                 write_walk(folder, walk)
-            rows.append({"walk": number, "wall": walk.wall, "onward": walk.onward, **measured(folder, walk, words.colour)})
+            rows.append(
+                {"walk": number, "wall": walk.wall, "onward": walk.onward, **measured(folder, walk, words.colour)}
+            )
             print(json.dumps(rows[-1]), flush=True)
     table = summary(rows)
     print(machine())
