@@ -19,8 +19,8 @@ from list3r.reconstruction.rgbd.odometry import CameraTracker
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.rendering.render import Renderer
-from list3r.simulation.rendering.sensor import sense
+from list3r.simulation.rendering.render import RenderedFrame, Renderer
+from list3r.simulation.rendering.sensor import SensorSettings, sense
 from tests.rgbd_scenes import CAMERA, along_a_striped_wall, black, frames_along, pose_errors, render, walk
 
 
@@ -191,6 +191,17 @@ def test_a_bare_wall_does_not_tell_how_the_camera_moves() -> None:
     poses[:, 0, 3] = 0.05 * np.arange(6)
     with pytest.raises(TrackingError, match="0 to 5"):
         RgbdReconstructor()(frames_along(poses, contrast=0.0, boxes=()), CAMERA)
+
+
+def test_noise_of_one_view_does_not_hold_the_camera_before_a_bare_wall() -> None:
+    shape = (CAMERA.height, CAMERA.width)
+    shade = np.linspace(150, 190, CAMERA.width, dtype=np.float32)
+    color = np.tile(shade[None, :, None], (CAMERA.height, 1, 3))
+    wall = RenderedFrame(color, np.full(shape, 0.8, np.float32), np.zeros(shape, np.int32), np.ones(shape, np.float32))
+    seen = [sense(wall, SensorSettings(), 0, k, k / 15) for k in range(6)]
+    frames = [Frame(k, k / 15, f.color, f.depth, None) for k, f in enumerate(seen)]
+    with pytest.raises(TrackingError, match="0 to 5"):
+        RgbdReconstructor()(frames, CAMERA)
 
 
 def test_noise_is_not_followed() -> None:
