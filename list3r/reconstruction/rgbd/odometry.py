@@ -467,7 +467,7 @@ class CameraTracker:
         if wide:
             seen = other.keyframes[:: max(1, len(other.keyframes) // s.join_keyframes)][: s.join_keyframes]
         for position in seen:
-            near = sorted(base.keyframes, key=lambda k, p=position: abs(k - p))[: 3 * s.join_keyframes]
+            near = [k for _, k in sorted((abs(k - position), k) for k in base.keyframes)][: 3 * s.join_keyframes]
             found = self._search(base, position, nearby=False, known=near if wide else None)
             if found is not None:
                 self._leave_out(position, found)
