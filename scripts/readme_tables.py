@@ -13,7 +13,7 @@ import re
 import sys
 from collections.abc import Callable
 
-from tables.association import alignment, changed, fair, kitchen, registration, returns, worth
+from tables.association import alignment, changed, fair, kitchen, methods, registration, returns, worth
 from tables.exports import batches, catalogue, exports, pack, receivers
 from tables.results import ROOT
 from tables.summary import summary
@@ -26,6 +26,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "discovery": discovery,
     "memories": memories,
     "fair": fair,
+    "methods": methods,
     "worth": worth,
     "returns": returns,
     "registration": registration,
