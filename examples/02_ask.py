@@ -13,18 +13,18 @@ def main() -> None:
         things = memory.instances()
         smallest = min(things, key=lambda thing: float(thing.box.size.prod()))
 
-        print(f"nearest to the {smallest.description} ({smallest.id}), surface to surface:")
-        for match in memory.nearest(smallest.id, k=3):
-            print(f"  {match.distance_m:.2f} {memory.units}  {match.instance.description} ({match.instance.id})")
+        print(f"nearest to the {smallest.name} ({smallest.id}), surface to surface:")
+        for match in memory.nearest(smallest, k=3):
+            print(f"  {match.distance_m:.2f} {memory.units}  {match.instance.name} ({match.instance.id})")
 
         print("on something:")
         for relation in memory.relations(predicate="on"):
-            subject, base = memory.instance(relation.subject), memory.instance(relation.object)
-            print(f"  {subject.description} on {base.description}, confidence {relation.confidence:.2f}")
+            subject, base = memory[relation.subject], memory[relation.object]
+            print(f"  {subject.name} on {base.name}, confidence {relation.confidence:.2f}")
 
         print("within half a metre of it:")
         for match in memory.within(center=smallest.center, radius=0.5):
-            print(f"  {match.instance.description}")
+            print(f"  {match.instance.name}")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     >>> import list3r
     >>> memory = list3r.build("walk/", "house.l3r")          # or list3r.open("house.l3r")
-    >>> for match in memory.nearest(point=(0.0, 0.0, 1.0), k=3):
-    ...     print(match.instance.id, match.instance.description, match.distance_m)
+    >>> for match in memory.nearest((0.0, 0.0, 1.0), k=3):
+    ...     print(match.instance.id, match.instance.name, match.distance_m)
     >>> memory.relations(subject=12, predicate="on")
 
 Nothing heavy is imported before it is needed.

@@ -6,31 +6,39 @@ The module of a question is imported when it is asked, so that simple questions 
 from __future__ import annotations
 
 import functools
+import html
+import io
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from list3r.memory.core.errors import List3rError, OptionError, check_share, naming_extras
+from list3r.memory.core.errors import List3rError, OptionError, UnknownIdError, check_share, naming_extras
+from list3r.memory.core.records import Instance, id_of
 from list3r.memory.library.maintenance.editing import MemoryEdits
 from list3r.memory.library.world.scale import Lengths, lengths_of
 from list3r.memory.store.store import Store
+from list3r.queries.answers import Answers
 
 if TYPE_CHECKING:
     import networkx
+    import open3d
+    import pandas
+    import trimesh
+    from matplotlib.figure import Figure
 
     from list3r.exporters.prompt.scene_text import ScenePrompt
     from list3r.exporters.registry import ExportOptions
-    from list3r.exporters.tables import Table, Value
+    from list3r.exporters.tables import Table
     from list3r.frames.options import SourceOptions
     from list3r.memory.core.geometry import Sim3
-    from list3r.memory.core.records import FrameRow, Instance, Relation, Session, Support
+    from list3r.memory.core.records import FrameRow, Relation, Session, Support
     from list3r.pipeline.request import BuildRequest, RunArguments
     from list3r.pipeline.settings import BuildSettings
     from list3r.queries.changes import Changed
@@ -55,7 +63,10 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
     def guarded(self: SceneMemory, /, *args: P.args, **kwargs: P.kwargs) -> R:
         # An answer must see one state while another process writes; a writer has none beside it.
         with naming_extras(), self._lock, nullcontext() if self.store.writable else self.store.snapshot():
-            return method(self, *args, **kwargs)
+            answer = method(self, *args, **kwargs)
+            if isinstance(answer, Answers):
+                answer.picture_of = self._thumbnail
+            return answer
 
     return guarded
 
@@ -170,10 +181,129 @@ class SceneMemory(MemoryEdits):
     def __iter__(self) -> Iterator[Instance]:
         return iter(self.instances())
 
-    def __contains__(self, instance_id: object) -> bool:
-        return isinstance(instance_id, int | np.integer) and any(
-            i.id == instance_id for i in self.instances(structure=None)
+    def __contains__(self, what: object) -> bool:
+        if isinstance(what, str):
+            return bool(self._named(what))
+        return isinstance(what, int | np.integer | Instance) and any(
+            i.id == id_of(what) for i in self.instances(structure=None)
         )
+
+    @overload
+    def __getitem__(self, what: int | Instance) -> Instance: ...
+
+    @overload
+    def __getitem__(self, what: str) -> Answers[Instance]: ...
+
+    def __getitem__(self, what: int | str | Instance) -> Instance | Answers[Instance]:
+        """Return the instance of an id, or by id all that carry a name, structure too (those that are gone as well).
+
+        A name is compared with labels, kinds of structure and descriptions, as by the filter `label`. Raises
+        `UnknownIdError`, a `KeyError`; for a name it tells close ones.
+
+        >>> memory[12].name
+        >>> memory["chair"].boxes
+        """
+        if isinstance(what, int | np.integer | Instance):
+            return self.instance(what)
+        if not isinstance(what, str):
+            raise OptionError(f"memory[{what!r}]: give an id or a name; list(memory) is sliced")
+        found = self._named(what)
+        if not found:
+            from difflib import get_close_matches
+
+            names = sorted({i.name for i in self.instances(structure=None)})
+            close = get_close_matches(what, names, 5, 0.5) or names[:5]
+            told = f"; close names: {', '.join(close)}" if close else ""
+            raise UnknownIdError(f"{self.path} has nothing called {what!r}{told}")
+        return found
+
+    @_alone
+    def _named(self, name: str) -> Answers[Instance]:
+        from list3r.queries.finding.words import is_named
+
+        return Answers(i for i in self.store.instances.all() if is_named(i, name))
+
+    def _thumbnail(self, instance_id: int) -> bytes | None:
+        """Return a JPEG of the instance of at most 96 px, None where no stored picture shows it or the file is shut."""
+        from PIL import Image
+
+        try:
+            image = Image.fromarray(self.picture(instance_id).crop())
+        except List3rError:
+            return None
+        image.thumbnail((96, 96))
+        out = io.BytesIO()
+        image.save(out, "JPEG", quality=80)
+        return out.getvalue()
+
+    def _repr_html_(self) -> str:
+        return f"<p>{html.escape(repr(self)[1:-1])}</p>{self.instances()._repr_html_()}"
+
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """Lower and upper corner of every thing, in the order of iteration, world. Shape (N, 2, 3).
+
+        >>> memory.boxes[:, 1] - memory.boxes[:, 0]
+        """
+        return self.instances().boxes
+
+    @property
+    @_alone
+    def points(self) -> NDArray[np.float32]:
+        """Surface points of all things, one after the other, world; `support(12).points` are those of one. (P, 3).
+
+        >>> memory.points.mean(axis=0)
+        """
+        surfaces = [self.store.surfaces.of(i.id).points for i in self.store.instances.all(structure=False)]
+        return np.concatenate(surfaces) if surfaces else np.zeros((0, 3), np.float32)
+
+    @_alone
+    def to_dataframe(self, table: Table = "instances") -> pandas.DataFrame:
+        """Return the table of instances (structure too), relations or frames.
+
+        Columns are those of `list3r.exporters.tables.COLUMNS`. Raises `MissingPackageError` without pandas, and
+        `OptionError` for another table.
+
+        >>> memory.to_dataframe().set_index("id")
+        """
+        from list3r.exporters.tables import records_of
+        from list3r.queries.answers import dataframe
+
+        return dataframe(records_of(self.store, table))
+
+    @_alone
+    def to_open3d(self, *which: int | Instance, structure: bool | None = False) -> open3d.geometry.PointCloud:
+        """Return the coloured points of some instances, by default of all things, as one cloud of open3d.
+
+        >>> open3d.visualization.draw_geometries([memory.to_open3d()])
+        """
+        from list3r.exporters.clouds import open3d_cloud
+
+        return open3d_cloud(self.store, self._chosen(which, structure))
+
+    @_alone
+    def to_trimesh(self, *which: int | Instance, structure: bool | None = False) -> trimesh.Scene:
+        """Return some instances, by default all things, as a scene of trimesh: a point cloud each, called "ID NAME".
+
+        >>> memory.to_trimesh(12).extents
+        """
+        from list3r.exporters.clouds import trimesh_scene
+
+        return trimesh_scene(self.store, self._chosen(which, structure))
+
+    def _chosen(self, which: Sequence[int | Instance], structure: bool | None) -> list[Instance]:
+        return [self.instance(i) for i in which] or self.store.instances.all(structure=structure)
+
+    @_alone
+    def plot(self) -> Figure:
+        """Return the plan of the largest component as a figure of matplotlib; its axes are the memory's x and y.
+
+        >>> memory.plot().savefig("plan.pdf")
+        """
+        from list3r.exporters.components import read_components
+        from list3r.exporters.plan.drawing import plan_figure
+
+        return plan_figure(self.store, read_components(self.store)[0])
 
     @_alone
     def info(self) -> dict[str, Any]:
@@ -215,42 +345,45 @@ class SceneMemory(MemoryEdits):
             return self.store.facts.gravity
 
     @_alone
-    def instances(self, *, structure: bool | None = False) -> list[Instance]:
-        """Return the things by id; with `structure=True` the structure of the room, with None both."""
-        return self.store.instances.all(structure=structure)
+    def instances(self, *, structure: bool | None = False) -> Answers[Instance]:
+        """Return the things by id; with `structure=True` the structure of the room, with None both.
+
+        >>> memory.instances().to_dataframe()
+        """
+        return Answers(self.store.instances.all(structure=structure))
 
     @_alone
-    def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> list[Changed]:
+    def changes(self, since: int | None = None, *, min_confidence: float = 0.0) -> Answers[Changed]:
         """Return what was moved, removed and added in the sessions after `since`, the newest session first."""
         from list3r.queries.changes import changes
 
-        return changes(self.store, since, min_confidence=min_confidence)
+        return Answers(changes(self.store, since, min_confidence=min_confidence))
 
     @_alone
-    def instance(self, instance_id: int) -> Instance:
+    def instance(self, instance_id: int | Instance) -> Instance:
         """Return an instance by its id, or by any id it ever had. Raises `UnknownIdError`."""
-        return self.store.instances.get(instance_id)
+        return self.store.instances.get(id_of(instance_id))
 
     @_alone
-    def support(self, instance_id: int) -> Support:
+    def support(self, instance_id: int | Instance) -> Support:
         """Return the surface points of an instance, world coordinates."""
-        return self.store.surfaces.of(instance_id)
+        return self.store.surfaces.of(id_of(instance_id))
 
     @_alone
-    def track(self, instance_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def track(self, instance_id: int | Instance) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the path of a `dynamic` instance: seconds (V,) and world positions (V, 3); V = 0 for others."""
-        return self.store.tracks.of(instance_id)
+        return self.store.tracks.of(id_of(instance_id))
 
     @_alone
     def nearest(
         self,
-        target: str | int | ArrayLike,
+        target: str | int | Instance | ArrayLike,
         k: int = 5,
         *,
         max_distance: float | None = None,
         **filters: Unpack[FilterOptions],
     ) -> Matches:
-        """Return the k things nearest to a point (x, y, z) or to an instance (its id), or those that words name best.
+        """Return the k things nearest to a point (x, y, z) or to an instance, or those that words name best.
 
         Distances are between surfaces and between centres. For the filters (`structure`, `min_confidence`, `state`,
         `label`, `color`, `min_size`, `max_size`, `component`, `dynamic`) see `list3r.queries.match.Filters`.
@@ -262,8 +395,8 @@ class SceneMemory(MemoryEdits):
         if isinstance(target, str):
             encoder = self.word_encoder()
             return nearest(self.store, words=target, k=k, max_distance=max_distance, encoder=encoder, **filters)
-        if isinstance(target, int | np.integer):
-            return nearest(self.store, instance_id=int(target), k=k, max_distance=max_distance, **filters)
+        if isinstance(target, int | np.integer | Instance):
+            return nearest(self.store, instance_id=id_of(target), k=k, max_distance=max_distance, **filters)
         return nearest(self.store, point=target, k=k, max_distance=max_distance, **filters)
 
     @_alone
@@ -278,7 +411,7 @@ class SceneMemory(MemoryEdits):
         max_depth: float | None = None,
         occlusion: bool = True,
         **filters: Unpack[FilterOptions],
-    ) -> list[Match]:
+    ) -> Answers[Match]:
         """Return the things in a box (`lower`, `upper`), a sphere (`center`, `radius`) or the frustum of a `camera`.
 
         `memory.camera(...)` makes a camera. What other things hide from it is left out, unless `occlusion` is off.
@@ -287,33 +420,35 @@ class SceneMemory(MemoryEdits):
         """
         from list3r.queries.within import within
 
-        return within(
-            self.store,
-            lower=lower,
-            upper=upper,
-            center=center,
-            radius=radius,
-            camera=camera,
-            max_depth=max_depth,
-            occlusion=occlusion,
-            **filters,
+        return Answers(
+            within(
+                self.store,
+                lower=lower,
+                upper=upper,
+                center=center,
+                radius=radius,
+                camera=camera,
+                max_depth=max_depth,
+                occlusion=occlusion,
+                **filters,
+            )
         )
 
     @_alone
     def similar(
         self,
-        target: int | ArrayLike,
+        target: int | Instance | ArrayLike,
         k: int = 5,
         *,
         space: str | None = None,
         **filters: Unpack[FilterOptions],
-    ) -> list[Match]:
-        """Return the things that look most like an instance (its id), or like a vector of a named embedding space."""
+    ) -> Answers[Match]:
+        """Return the things that look most like an instance, or like a vector of a named embedding space."""
         from list3r.queries.similar import similar
 
-        if isinstance(target, int | np.integer):
-            return similar(self.store, instance_id=int(target), space=space, k=k, **filters)
-        return similar(self.store, vector=target, space=space, k=k, **filters)
+        if isinstance(target, int | np.integer | Instance):
+            return Answers(similar(self.store, instance_id=id_of(target), space=space, k=k, **filters))
+        return Answers(similar(self.store, vector=target, space=space, k=k, **filters))
 
     @_alone
     def similar_to_picture(
@@ -323,7 +458,7 @@ class SceneMemory(MemoryEdits):
         *,
         box_xyxy: tuple[float, float, float, float] | None = None,
         **filters: Unpack[FilterOptions],
-    ) -> list[Match]:
+    ) -> Answers[Match]:
         """Return the things that look most like a picture (a file, or RGB of shape (H, W, 3)), or like a box of it.
 
         Compared by the model of `list3r embed`, or by colours alone if it was not run. The reason says which.
@@ -334,11 +469,11 @@ class SceneMemory(MemoryEdits):
         from list3r.semantics.picture_query import picture_query
 
         asked = picture_query(self.store, image, box_xyxy)
-        return similar(self.store, vector=asked.vector, space=asked.space, part=asked.part, k=k, **filters)
+        return Answers(similar(self.store, vector=asked.vector, space=asked.space, part=asked.part, k=k, **filters))
 
     @_alone
     def find(
-        self, text: str, k: int = 5, *, viewpoint: Place | None = None, encoder: WordEncoder | None = None
+        self, text: str, k: int = 5, *, viewpoint: Place | Instance | None = None, encoder: WordEncoder | None = None
     ) -> Found:
         """Return the things that a text describes, the best first. If nothing fits, `notes` say why.
 
@@ -352,7 +487,8 @@ class SceneMemory(MemoryEdits):
         """
         from list3r.queries.find import find
 
-        return find(self.store, text, k, viewpoint=viewpoint, encoder=encoder or self.word_encoder())
+        seen_from = viewpoint.id if isinstance(viewpoint, Instance) else viewpoint
+        return find(self.store, text, k, viewpoint=seen_from, encoder=encoder or self.word_encoder())
 
     def word_encoder(self) -> WordEncoder | None:
         """Return the model that compares free words, or None if the memory was not embedded by a text-image model."""
@@ -361,11 +497,11 @@ class SceneMemory(MemoryEdits):
         return stored_text_model(self.store)
 
     @_alone
-    def seen(self, instance_id: int, *, gap_s: float = 1.0) -> Sightings:
+    def seen(self, instance_id: int | Instance, *, gap_s: float = 1.0) -> Sightings:
         """Return when and in which frames an instance was seen. Gaps up to `gap_s` seconds do not end an interval."""
         from list3r.queries.seen import seen
 
-        return seen(self.store, instance_id, gap_s=gap_s)
+        return seen(self.store, id_of(instance_id), gap_s=gap_s)
 
     @_alone
     def visible(
@@ -375,14 +511,14 @@ class SceneMemory(MemoryEdits):
         min_visible: float = 0.1,
         max_depth: float | None = None,
         **filters: Unpack[FilterOptions],
-    ) -> list[Match]:
+    ) -> Answers[Match]:
         """Return what a camera sees: things of which at least a share of `min_visible` is not hidden by others.
 
         >>> memory.visible(memory.camera(time_s=12.5))
         """
         from list3r.queries.seen import visible
 
-        return visible(self.store, camera, min_visible=min_visible, max_depth=max_depth, **filters)
+        return Answers(visible(self.store, camera, min_visible=min_visible, max_depth=max_depth, **filters))
 
     @_alone
     def camera(
@@ -414,15 +550,15 @@ class SceneMemory(MemoryEdits):
     @_alone
     def relations(
         self,
-        subject: int | str | None = None,
+        subject: int | str | Instance | None = None,
         predicate: str | None = None,
-        object: int | str | None = None,
+        object: int | str | Instance | None = None,
         min_confidence: float = 0.0,
         *,
-        viewpoint: Place | None = None,
-        other: int | str | None = None,
+        viewpoint: Place | Instance | None = None,
+        other: int | str | Instance | None = None,
     ) -> Relations:
-        """Return the relations that match what is given (ids or words); `state` is unknown if the memory cannot decide.
+        """Return the relations that match what is given, by instance, id or words; `state` is unknown if none can tell.
 
         left_of, right_of, in_front_of and behind need a `viewpoint` (an id, "camera", "camera:FRAME" or a point);
         `between` needs `object` and `other`. Raises `OptionError` for an unknown predicate.
@@ -432,38 +568,30 @@ class SceneMemory(MemoryEdits):
         """
         from list3r.queries.relations import relations
 
-        return relations(self.store, subject, predicate, object, min_confidence, viewpoint=viewpoint, other=other)
+        a, b, c = (x.id if isinstance(x, Instance) else x for x in (subject, object, other))
+        seen_from = viewpoint.id if isinstance(viewpoint, Instance) else viewpoint
+        return relations(self.store, a, predicate, b, min_confidence, viewpoint=seen_from, other=c)
 
     @_alone
-    def relations_of(self, instance_id: int) -> list[Relation]:
+    def relations_of(self, instance_id: int | Instance) -> Answers[Relation]:
         """Return the stored relations of an instance, each once: `on`, but not its inverse `supports`."""
         from list3r.queries.relations import relations_of
 
-        return relations_of(self.store, self.store.instances.get(instance_id).id)
+        return Answers(relations_of(self.store, self.store.instances.get(id_of(instance_id)).id))
 
     @_alone
-    def measure(self, a: int, b: int) -> InstanceDistance:
+    def measure(self, a: int | Instance, b: int | Instance) -> InstanceDistance:
         """Return the distances of surfaces and of centres. Raises `UnknownIdError` and `OptionError`."""
         from list3r.queries.measure import measure
 
-        return measure(self.store, a, b)
+        return measure(self.store, id_of(a), id_of(b))
 
     @_alone
-    def path_between(self, start: int, end: int, *, structure: bool = True) -> Relations:
+    def path_between(self, start: int | Instance, end: int | Instance, *, structure: bool = True) -> Relations:
         """Return the shortest chain of relations between two instances, with `structure` also over floor and walls."""
         from list3r.queries.path import path
 
-        return path(self.store, start, end, structure=structure)
-
-    @_alone
-    def to_records(self, table: Table = "instances") -> list[dict[str, Value]]:
-        """Return the instances, relations or frames as flat dicts, as `pandas.DataFrame` takes them.
-
-        >>> pandas.DataFrame(memory.to_records()).set_index("id")
-        """
-        from list3r.exporters.tables import records_of
-
-        return records_of(self.store, table)
+        return path(self.store, id_of(start), id_of(end), structure=structure)
 
     @_alone
     def sessions(self) -> list[Session]:
@@ -476,14 +604,14 @@ class SceneMemory(MemoryEdits):
         return self.store.trajectory.poses(session)
 
     @_alone
-    def pictures(self, instance_ids: Sequence[int] | None = None) -> list[KeyframePicture]:
+    def pictures(self, instance_ids: Sequence[int | Instance] | None = None) -> list[KeyframePicture]:
         """Return the keyframes with a stored picture, and the instances in each; or only those of some instances."""
         from list3r.queries.pictures import keyframe_pictures
 
-        return keyframe_pictures(self.store, instance_ids)
+        return keyframe_pictures(self.store, None if instance_ids is None else [id_of(i) for i in instance_ids])
 
     @_alone
-    def picture(self, instance_id: int) -> InstancePicture:
+    def picture(self, instance_id: int | Instance) -> InstancePicture:
         """Return the stored picture that shows an instance best, with its mask.
 
         Raises `UnknownIdError` and `OptionError`.
@@ -492,7 +620,7 @@ class SceneMemory(MemoryEdits):
         """
         from list3r.queries.pictures import instance_picture
 
-        return instance_picture(self.store, instance_id)
+        return instance_picture(self.store, id_of(instance_id))
 
     @_alone
     def pixels(self, picture: KeyframePicture) -> NDArray[np.uint8]:
@@ -528,19 +656,25 @@ class SceneMemory(MemoryEdits):
         return merge_graph(self.store)
 
     @_alone
-    def export(self, format: str, path: str | Path, **options: Unpack[ExportOptions]) -> tuple[Path, ...]:
-        """Write the memory in one of `list3r.exporters.registry.FORMATS`. Raises `OptionError` and `ExportError`.
+    def export(
+        self, format: str | Path, path: str | Path | None = None, **options: Unpack[ExportOptions]
+    ) -> tuple[Path, ...]:
+        """Write the memory in one of `list3r.exporters.registry.FORMATS`; a file alone says its format by its suffix.
 
         Returns the files written: `path`, and more beside it if the memory has several connected components. `colmap`,
         `nerfstudio` and `prompt` are folders. `color` of ply and glb is rgb or instance; `tokens` and `question` of
-        prompt are those of `prompt()`.
+        prompt are those of `prompt()`. Raises `OptionError` and `ExportError`.
 
+            >>> memory.export("house.glb")
             >>> memory.export("ply", "house.ply", color="rgb")
         """
         from list3r.exporters.registry import export as export_memory
+        from list3r.exporters.registry import format_of
 
+        if path is None:
+            format, path = format_of(format), format
         with self.store.snapshot():
-            return export_memory(self, format, path, **options)
+            return export_memory(self, str(format), path, **options)
 
     def close(self) -> None:
         """Close the file."""

@@ -18,6 +18,7 @@ import pytest
 import list3r
 from list3r.cli.app import run
 from list3r.exporters.cameras.pictures import jpeg_size
+from list3r.exporters.tables import records_of
 from list3r.frames.source import open_source
 from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.store.store import Store
@@ -82,7 +83,7 @@ def test_parquet_tables_are_typed(room: Path, tmp_path: Path) -> None:
     with list3r.open(room) as memory:
         paths = memory.export("parquet", tmp_path / "room.parquet")
         for path, name in zip(paths, ("instances", "relations", "frames"), strict=True):
-            assert pq.read_table(path).to_pylist() == memory.to_records(name)
+            assert pq.read_table(path).to_pylist() == records_of(memory.store, name)
 
 
 @pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])

@@ -13,9 +13,11 @@ import pytest
 
 import list3r
 from list3r.api import SceneMemory
+from list3r.exporters.tables import records_of
 from list3r.memory.core.errors import MemoryFileError, OptionError, UnknownIdError
 from list3r.memory.store.store import Store
-from tests.conftest import write_small_room
+from list3r.queries.answers import Answers
+from tests.conftest import small_picture, write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
 
@@ -52,7 +54,7 @@ def questions(memory: SceneMemory) -> list[Callable[[], object]]:
         lambda: memory.seen(TABLE),
         lambda: sorted(memory.relation_graph().edges),
         lambda: len(memory.merge_graph()),
-        lambda: memory.to_records("frames"),
+        lambda: memory.to_dataframe("frames").to_dict("records")[4],
         lambda: memory.support(MUG).points.sum(),
     ]
 
@@ -79,13 +81,14 @@ def test_a_memory_that_is_read_refuses_to_be_written(memory: SceneMemory) -> Non
 
 def test_tables_are_flat_and_alike(memory: SceneMemory) -> None:
     for table, count in (("instances", 6), ("relations", 4), ("frames", 20)):
-        rows = memory.to_records(table)  # type: ignore[arg-type]
+        rows = records_of(memory.store, table)  # type: ignore[arg-type]
+        assert memory.to_dataframe(table).shape == (count, len(rows[0]))  # type: ignore[arg-type]
         assert len(rows) == count and len({tuple(r) for r in rows}) == 1
         assert all(v is None or type(v) in (int, float, str, bool) for r in rows for v in r.values())
-    mug = next(r for r in memory.to_records() if r["id"] == MUG)
+    mug = next(r for r in records_of(memory.store) if r["id"] == MUG)
     assert (mug["center_x"], mug["box_size_z"], mug["structure"]) == (pytest.approx(1.8), pytest.approx(0.1), None)
-    with pytest.raises(KeyError, match="instances"):
-        memory.to_records("things")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="instances"):
+        memory.to_dataframe("things")  # type: ignore[arg-type]
 
 
 def test_every_filter_filters(memory: SceneMemory) -> None:
@@ -152,7 +155,14 @@ def test_a_memory_says_what_it_holds(make_memory: Callable[..., Path], tmp_path:
     with list3r.open(make_memory()) as memory:
         assert repr(memory) == "<SceneMemory 'room.l3r': 4 instances, 2 of structure, 1 session, metric, z up>"
         assert len(memory) == 4 and [i.id for i in memory] == [2, 3, 4, 5]
-        assert 3 in memory and 1 in memory and 99 not in memory and "mug" not in memory
+        assert (
+            3 in memory
+            and 1 in memory
+            and 99 not in memory
+            and "mug" in memory
+            and "elephant" not in memory
+            and memory[3] in memory
+        )
         told = memory.info()
         assert (told["instances"], told["structure"], told["relations"], told["units"]) == (4, 2, 4, "m")
         assert memory._repr_png_().startswith(b"\x89PNG")
@@ -160,3 +170,81 @@ def test_a_memory_says_what_it_holds(make_memory: Callable[..., Path], tmp_path:
     Store.create(tmp_path / "empty.l3r").close()
     with list3r.open(tmp_path / "empty.l3r") as empty:
         assert empty and len(empty) == 0 and "0 instances" in repr(empty)
+
+
+def test_things_are_had_by_id_and_by_name(memory: SceneMemory) -> None:
+    mug = memory[MUG]
+    assert (mug.id, mug.name) == (MUG, "mug") and memory[mug].id == MUG
+    assert [i.id for i in memory["mug"]] == [MUG, TWIN] and [i.id for i in memory["floor"]] == [FLOOR]
+    with pytest.raises(KeyError, match="nothing called 'mugg'; close names: mug") as error:
+        memory["mugg"]
+    assert isinstance(error.value, UnknownIdError) and "\n" not in str(error.value)
+    with pytest.raises(UnknownIdError, match="77"):
+        memory[77]
+    with pytest.raises(OptionError, match="an id or a name"):
+        memory[1:2]  # type: ignore[call-overload]
+
+
+def test_an_instance_stands_where_an_id_goes(memory: SceneMemory) -> None:
+    mug, chair = memory[MUG], memory[CHAIR]
+    pairs: list[tuple[object, object]] = [
+        ([m.instance.id for m in memory.nearest(mug)], [m.instance.id for m in memory.nearest(MUG)]),
+        ([m.instance.id for m in memory.similar(mug)], [m.instance.id for m in memory.similar(MUG)]),
+        (memory.relations(mug, viewpoint=chair), memory.relations(MUG, viewpoint=CHAIR)),
+        (memory.relations(predicate="between", object=mug, other=chair),
+         memory.relations(predicate="between", object=MUG, other=CHAIR)),
+        (memory.relations_of(mug), memory.relations_of(MUG)),
+        (memory.seen(mug), memory.seen(MUG)),
+        (memory.measure(mug, chair).gap, memory.measure(MUG, CHAIR).gap),
+        (memory.path_between(mug, chair), memory.path_between(MUG, CHAIR)),
+        (len(memory.support(mug).points), len(memory.support(MUG).points)),
+    ]  # fmt: skip
+    for by_instance, by_id in pairs:
+        assert by_instance == by_id
+
+
+def test_an_edit_takes_an_instance(room: Path, tmp_path: Path) -> None:
+    with list3r.open(shutil.copy(room, tmp_path / "edit.l3r"), writable=True) as memory:
+        memory.label(memory[CHAIR], "throne")
+        assert [i.id for i in memory["throne"]] == [CHAIR]
+
+
+def test_things_become_arrays_tables_and_clouds(memory: SceneMemory) -> None:
+    np.testing.assert_array_equal(memory.boxes, [i.aabb for i in memory])
+    assert memory["mug"].boxes.shape == (2, 2, 3) and memory.find("elephant").boxes.shape == (0, 2, 3)
+    assert memory.points.shape == (sum(len(memory.support(i).points) for i in memory), 3)
+    found = memory.find("mug")
+    table = found.to_dataframe()
+    assert list(table["id"]) == [m.instance.id for m in found] and {"name", "score", "x", "reason"} <= set(table)
+    assert list(memory.relations().to_dataframe().columns) == ["subject", "predicate", "object", "confidence", "margin"]
+    cloud = pytest.importorskip("open3d") and memory.to_open3d(MUG)
+    np.testing.assert_allclose(np.asarray(cloud.points), memory.support(MUG).points, atol=1e-6)
+    scene = memory.to_trimesh()
+    assert len(scene.geometry) == 4 and f"{MUG} mug" in scene.geometry
+    assert memory.plot().axes
+
+
+def test_a_file_says_its_format(memory: SceneMemory, tmp_path: Path) -> None:
+    assert memory.export(tmp_path / "x.glb")[0].read_bytes()[:4] == b"glTF"
+    assert memory.export(str(tmp_path / "x.json"))[0].exists()
+    for wrong in ("x.xyz", "glb"):
+        with pytest.raises(OptionError, match=r"\.glb"):
+            memory.export(wrong)
+
+
+def test_a_notebook_shows_short_tables_with_pictures(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "pictures.l3r") as store, store.transaction():
+        write_small_room(store, small_picture())
+        label = '<script>alert("x")</script>'
+        store.instances.put([dataclasses.replace(store.instances.get(MUG), label=label)])
+    with list3r.open(tmp_path / "pictures.l3r") as memory:
+        for shown in (memory._repr_html_(), memory.nearest(MUG)._repr_html_()):
+            assert "data:image/jpeg;base64," in shown and "<script>" not in shown
+        answers = memory.instances() * 30
+        assert len(answers) == 120
+        answers = Answers(answers)
+        answers.picture_of = memory._thumbnail
+        assert answers._repr_html_().count("<tr>") == 21 and "100 more" in answers._repr_html_()
+        assert len(repr(answers)) < 4000 and "array(" not in repr(memory[MUG]) + repr(memory.nearest(MUG))
+        after = memory.instances()
+    assert "<img" not in after._repr_html_() and "mug" in after._repr_html_()

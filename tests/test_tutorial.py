@@ -25,4 +25,4 @@ def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
             assert cell["outputs"] == [], "outputs are not kept"
             exec("".join(cell["source"]), names)
     told = capsys.readouterr().out
-    assert "6 rows of" in told and "scene.json" in told and "my thing" in told and "no instance has the word" in told
+    assert "(4, 2, 3)" in told and "scene.json" in told and "my thing" in told and "no instance has the word" in told

@@ -137,6 +137,20 @@ def export(
     return written
 
 
+def format_of(path: str | Path) -> str:
+    """Return the name of the format that a file's suffix stands for. Raises `OptionError` for any other."""
+    suffix = Path(path).suffix.lower()
+    for name, form in FORMATS.items():
+        if suffix and suffix in form.suffixes:
+            return name
+    known = ", ".join(dict.fromkeys(s for form in FORMATS.values() for s in form.suffixes))
+    folders = ", ".join(name for name, form in FORMATS.items() if form.folder)
+    raise OptionError(
+        f"{path} has no suffix of a format; end it with one of {known}, or name the format and the path"
+        f" (folders: {folders})"
+    )
+
+
 def find_format(name: str) -> Format:
     """Return a format. Raises `OptionError` that names the known ones."""
     check_choice("format", name, FORMATS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Literal
 
+from list3r.memory.core.errors import check_choice
 from list3r.memory.core.geometry import quat_wxyz_from_rotation
 from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
@@ -51,10 +52,9 @@ COLUMNS: dict[Table, tuple[str, ...]] = {
 def records_of(store: Store, table: Table = "instances") -> list[dict[str, Value]]:
     """Return one flat dict of numbers and texts for each row; all rows have the keys `COLUMNS[table]`, in that order.
 
-    Raises `KeyError` for a table that does not exist.
+    Raises `OptionError` for a table that does not exist.
     """
-    if table not in COLUMNS:
-        raise KeyError(f"no table {table!r}; choose one of: {', '.join(COLUMNS)}")
+    check_choice("table", table, COLUMNS)
     return [dict(zip(COLUMNS[table], row, strict=True)) for row in rows_of(store, table)]
 
 

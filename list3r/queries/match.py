@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.core.errors import OptionError, UnknownIdError, check_choice, check_share
 from list3r.memory.core.records import BestView, Instance
 from list3r.memory.store.store import Store
+from list3r.queries.answers import Answers
 from list3r.queries.finding.words import is_colored, is_named, wanted_words
 
 STATES = ("present", "moved", "removed", "added", "unseen", "any")
@@ -44,7 +45,7 @@ class Match:
         return self.view or self.instance.best_view
 
 
-class Matches(list[Match]):
+class Matches(Answers[Match]):
     """Answers, the best first, with what can be said of the question as a whole."""
 
     def __init__(self, matches: Iterable[Match] = (), notes: Sequence[str] = (), total: int | None = None) -> None:

@@ -79,7 +79,7 @@ def list_instances(
     least = min_confidence or 0.0
     check_share("--min-confidence", least)
     with open_memory(memory, None if at is not None else min_confidence) as scene:
-        found = scene.instances(structure=None if structure else False)
+        found: list[Instance] = scene.instances(structure=None if structure else False)
         if at is not None:
             from list3r.memory.library.maintenance.history import world_at
 

@@ -32,8 +32,10 @@ class MemoryFileWarning(UserWarning):
     """Something beside a memory file that is not its own; the command line prints it as a note."""
 
 
-class UnknownIdError(List3rError):
-    """An instance id that the memory has never held."""
+class UnknownIdError(List3rError, KeyError):
+    """An instance id that the memory has never held, or a name that nothing in it carries."""
+
+    __str__ = Exception.__str__  # a KeyError would put its message in quotes
 
 
 class TrackingError(List3rError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, SupportsInt, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -383,6 +383,20 @@ class Instance:
     position_sigma_m: float | None = None
     """Standard deviation of its position from the uncertainty of its chunks, world units, along the worst axis; None
     where it is not known."""
+
+    @property
+    def name(self) -> str:
+        """Its label, else the kind of structure, else its description."""
+        return self.label or self.structure or self.description
+
+    def __repr__(self) -> str:
+        x, y, z = self.center
+        return f"<Instance {self.id}: {self.name} at ({x:.2f}, {y:.2f}, {z:.2f}), confidence {self.confidence:.2f}>"
+
+
+def id_of(what: SupportsInt | Instance) -> int:
+    """Return the id of an instance, or the id itself."""
+    return what.id if isinstance(what, Instance) else int(what)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 from list3r.memory.core.errors import MemoryFileError
+from list3r.memory.core.records import Instance, id_of
 from list3r.memory.store.store import Store
 
 if TYPE_CHECKING:
@@ -21,36 +22,36 @@ class MemoryEdits:
     _lock: AbstractContextManager[Any]
     """Lets one thread in at a time."""
 
-    def merge(self, a: int, b: int, *, author: str | None = None) -> EditReport:
+    def merge(self, a: int | Instance, b: int | Instance, *, author: str | None = None) -> EditReport:
         """Say that two instances are one; the older id stays, the other becomes its alias for ever."""
         from list3r.memory.library.maintenance import edits
 
         with self._lock:
-            return edits.merge(self._writable(), a, b, author)
+            return edits.merge(self._writable(), id_of(a), id_of(b), author)
 
     def split(
-        self, instance_id: int, out: Sequence[tuple[int, int]] | None = None, *, author: str | None = None
+        self, instance_id: int | Instance, out: Sequence[tuple[int, int]] | None = None, *, author: str | None = None
     ) -> EditReport:
         """Say that an instance is two. The local instances `out` (chunk id, local id) leave it; by default those that
         the evidence separates best."""
         from list3r.memory.library.maintenance import edits
 
         with self._lock:
-            return edits.split(self._writable(), instance_id, out, author)
+            return edits.split(self._writable(), id_of(instance_id), out, author)
 
-    def label(self, instance_id: int, text: str | None, *, author: str | None = None) -> EditReport:
+    def label(self, instance_id: int | Instance, text: str | None, *, author: str | None = None) -> EditReport:
         """Name an instance; None takes the name away."""
         from list3r.memory.library.maintenance import edits
 
         with self._lock:
-            return edits.label(self._writable(), instance_id, text, author)
+            return edits.label(self._writable(), id_of(instance_id), text, author)
 
-    def delete(self, instance_id: int, *, author: str | None = None) -> EditReport:
+    def delete(self, instance_id: int | Instance, *, author: str | None = None) -> EditReport:
         """Remove an instance, also from later sessions."""
         from list3r.memory.library.maintenance import edits
 
         with self._lock:
-            return edits.delete(self._writable(), instance_id, author)
+            return edits.delete(self._writable(), id_of(instance_id), author)
 
     def scale(self, anchor: str, *, author: str | None = None) -> EditReport:
         """Give a known length, like `12=0.095m` or `camera_height=1.5m`; lengths are metres from then on."""
@@ -66,12 +67,12 @@ class MemoryEdits:
         with self._lock:
             return edits.undo(self._writable(), entry, author)
 
-    def merges(self, instance_id: int | None = None) -> list[LogEntry]:
+    def merges(self, instance_id: int | Instance | None = None) -> list[LogEntry]:
         """Return the merge log, oldest first, or only the entries of one instance. Raises `UnknownIdError`."""
         from list3r.memory.library.maintenance.merge_log import merge_log
 
         with self._lock:
-            return merge_log(self.store, instance_id)
+            return merge_log(self.store, None if instance_id is None else id_of(instance_id))
 
     def _writable(self) -> Store:
         if not self.store.writable:
