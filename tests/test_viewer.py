@@ -395,7 +395,7 @@ def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path:
             assert memory.instance(MUG).label == "blue <b>cup</b>"
             browser.key("d")
             browser.wait(lambda: viewer.state.dark)
-            browser.wait(lambda: float(browser.picture()[700:780, 20:200].mean()) < 90)
+            browser.wait(lambda: float(browser.picture()[25:45, 1080:1160].mean()) < 90)  # the panel's head
             browser.press("Link to this view")
             found = "([...document.querySelectorAll('input')].find(i => i.value.includes('?view=')) || {}).value"
             browser.wait(lambda: browser.run(found))

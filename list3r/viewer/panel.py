@@ -113,8 +113,7 @@ class Panel:
             self._things = self._gui.add_html("")
             self._mark = self._gui.add_html("")
 
-        @text.on_update
-        def _(_: object) -> None:
+        def narrow(_: object) -> None:
             if not _CLICKED.fullmatch(text.value) and text.value != self._typed:
                 self._typed, self._answers = text.value, None
                 self.say("")
@@ -128,6 +127,7 @@ class Panel:
             elif text.value.strip():
                 self._viewer.find(text.value.strip())
 
+        text.on_update(narrow)
         form.on_submit(search)
         button.on_click(search)
 
