@@ -71,7 +71,7 @@ def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, An
     """Time of the page to load, to turn and to search."""
     began = time.monotonic()
     page.open(viewer.address)
-    page.wait(lambda: "Click an object, or search for one." in page.text(), 300)
+    page.wait(lambda: "Click a thing in the list" in page.text(), 300)
     page.wait(viewer.server.get_clients, 300)
     loaded = time.monotonic() - began
     page.wait(lambda: [p for p in viewer._pages.values() if p.at_rest], 300)

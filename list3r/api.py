@@ -370,6 +370,15 @@ class SceneMemory(MemoryEdits):
         return self.store.surfaces.of(id_of(instance_id))
 
     @_alone
+    def surfaces(self) -> dict[int, Support]:
+        """Return all points that are known of each present instance, by id, and under 0 those of no instance, from the
+        pictures that are kept; world coordinates. The most that there is to look at.
+        """
+        from list3r.queries.views.dense import dense_surfaces
+
+        return dense_surfaces(self.store)
+
+    @_alone
     def track(self, instance_id: int | Instance) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the path of a `dynamic` instance: seconds (V,) and world positions (V, 3); V = 0 for others."""
         return self.store.tracks.of(id_of(instance_id))

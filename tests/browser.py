@@ -128,6 +128,13 @@ class Browser:
                 "Input.dispatchKeyEvent", type=kind, key=letter, code=f"Key{letter.upper()}", windowsVirtualKeyCode=code
             )
 
+    def enter(self) -> None:
+        """Press Enter where the focus is."""
+        for kind in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13, text="\r"
+            )
+
     def picture(self) -> np.ndarray:
         """What the page looks like. RGB, shape (H, W, 3)."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

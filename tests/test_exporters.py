@@ -95,7 +95,7 @@ BESIDE = {
     "node-link": ("merges",),
 }
 """The further files that a memory of one component gives."""
-WHOLE = ("json", "usd", "rerun", "report", *BESIDE)
+WHOLE = ("json", "usd", "rerun", "report", "web", *BESIDE)
 """Formats that hold all components, each in a frame or table of its own."""
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import html.parser
 import importlib
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +21,9 @@ import list3r
 from list3r.cli.app import run
 from list3r.exporters.cameras.pictures import jpeg_size
 from list3r.exporters.tables import records_of
+from list3r.exporters.web.page import WebSettings, write_web
 from list3r.frames.source import open_source
+from list3r.memory.core.description.printable import shown
 from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.store.store import Store
 from tests.browser import PROGRAM, Browser
@@ -181,6 +185,65 @@ def test_the_page_can_be_searched(room: Path, tmp_path: Path) -> None:
         assert browser.errors == []
     finally:
         browser.close()
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="no Chromium on this machine")
+def test_the_scene_can_be_searched_and_clicked_from_disk(room: Path, tmp_path: Path) -> None:
+    with list3r.open(room) as memory:
+        (path,) = memory.export("web", tmp_path / "web.html")
+        chair = memory.instance(5)
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(path.as_uri())
+        browser.wait(lambda: browser.run("document.querySelectorAll('#list button').length") == 6)
+        assert browser.run("document.querySelectorAll('b[onclick]').length") == 0
+        browser.run("search.focus()")
+        browser.call("Input.insertText", text="where is the seat?")
+        browser.enter()
+        browser.wait(lambda: browser.run("selected") == chair.id)  # by what a chair is a kind of
+        browser.wait(lambda: np.allclose(browser.run("eye.at"), chair.center, atol=0.01))
+        assert "chair" in browser.run("get('about').innerText")
+        browser.run("search.value = 'elephant'; search.form.requestSubmit()")
+        browser.says("Nothing found for \u201celephant\u201d")
+        assert browser.run("selected") is None and browser.run("get('about').hidden")
+        browser.run("search.value = ''; list(); [...rows.values()][0].click()")
+        assert browser.run("selected") == browser.run("[...rows.keys()][0]")
+        browser.run(f"select({chair.id}, true)")
+        browser.wait(lambda: np.allclose(browser.run("eye.at"), chair.center, atol=0.01))
+        time.sleep(1)
+        browser.run("select(null)")
+        width, height = browser.run("[canvas.clientWidth, canvas.clientHeight]")
+        browser.click(width / 2, height / 2)
+        browser.wait(lambda: browser.run("selected") is not None)  # its points are few: perhaps the floor behind
+        light = browser.picture()[:40, :40].mean()
+        browser.run("get('dark').click()")
+        browser.wait(lambda: abs(browser.picture()[:40, :40].mean() - light) > 100)
+        assert browser.errors == []
+    finally:
+        browser.close()
+
+
+def test_the_scene_page_loads_nothing_escapes_names_and_keeps_its_size(room: Path, tmp_path: Path) -> None:
+    with list3r.open(room) as memory:
+        (path,) = memory.export("web", tmp_path / "web.html")
+        text = path.read_text(encoding="utf-8")
+        links = Links()
+        links.feed(text)
+        assert links.addresses == [] and links.elements.count("script") == 3 and "b" not in links.elements
+        data = json.loads(text.split('id="data">')[1].split("</script>")[0])
+        assert data["instances"][2]["name"] == shown(NASTY) and data["units"] == memory.units
+        assert data["cloud"]["kept"] == data["cloud"]["known"] == sum(many for _, many, _ in data["cloud"]["runs"])
+        few = write_web(memory, tmp_path / "few.html", WebSettings(megabytes=0.001))[0].read_text(encoding="utf-8")
+        cloud = json.loads(few.split('id="data">')[1].split("</script>")[0])["cloud"]
+        assert cloud["kept"] < cloud["known"] == data["cloud"]["known"] and all(many for _, many, _ in cloud["runs"])
+        raw = base64.b64decode(text.split('id="points">')[1].split("</script>")[0])
+        whole = data["cloud"]
+        steps = np.frombuffer(raw, "<u2", 3 * whole["kept"]).reshape(-1, 3)
+        places = np.array(whole["low"]) + whole["span"] * steps / 65535
+        starts = np.cumsum([0, *(many for _, many, _ in whole["runs"])])
+        known = memory.surfaces()
+        for (n, many, _), start in zip(whole["runs"], starts, strict=False):
+            assert places[start : start + many] == pytest.approx(known[n].points, abs=whole["span"] / 60000)
 
 
 def test_a_pipe_gets_one_whole_file(room: Path, tmp_path: Path, make_memory: Callable[..., Path]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import time
 import urllib.error
 import urllib.request
@@ -19,7 +18,6 @@ from hypothesis import strategies as st
 import list3r
 from list3r.cli.app import run
 from list3r.memory.core.errors import List3rError
-from list3r.memory.core.geometry import OrientedBox
 from list3r.memory.core.records import Relation
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.store.store import Store
@@ -34,11 +32,12 @@ from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from list3r.viewer.app import Viewer, ViewerSettings
-from list3r.viewer.box_lines import thin_lines
 from list3r.viewer.clouds import FINE, CloudSettings
 from list3r.viewer.instance_text import described
 from list3r.viewer.link import ViewState
+from list3r.viewer.listing import filtered, legend, listed
 from list3r.viewer.names import on_page, with_room
+from list3r.viewer.panel import NOTHING_SELECTED
 from list3r.viewer.side_by_side import SideBySide
 from list3r.viewer.world import (
     COLOR_MODES,
@@ -48,6 +47,7 @@ from list3r.viewer.world import (
     colors,
     overview,
     pick,
+    point_size,
     read_path,
     read_world,
 )
@@ -112,7 +112,7 @@ def test_the_overview_keeps_its_bound_and_small_things(counts: list[int], most: 
 def test_a_part_of_a_cloud_has_the_points_asked_for(ranges: list[tuple[int, int]]) -> None:
     counts = np.full(len(ranges), 9)
     points = np.arange(27 * len(ranges), dtype=np.float32).reshape(-1, 3)
-    cloud = ShownCloud(points, points.astype(np.uint8), 5 + np.arange(len(ranges)), counts)
+    cloud = ShownCloud(points, points.astype(np.uint8), 5 + np.arange(len(ranges)), counts, np.ones(len(ranges)))
     low, high = np.array(ranges).T
     part = cloud.part(low, high)
     wanted = [points[9 * k + a : 9 * k + b] for k, (a, b) in enumerate(ranges)]
@@ -151,6 +151,32 @@ def test_colours_are_those_of_the_mode(two_sessions: Path) -> None:
     assert (own == world.cloud.rgb).all()
     chosen = colors(world, world.cloud, "own colour", moved)
     assert ((chosen != own).any(axis=1) <= (world.cloud.owner == moved)).all() and (chosen != own).any()
+
+
+def test_changes_have_a_legend(two_sessions: Path, room: Path) -> None:
+    with list3r.open(two_sessions) as memory:
+        text = legend(read_world(memory, memory.changes()))
+    assert "0 added" in text and "1 moved" in text and "1 removed" in text
+    with list3r.open(room) as memory:
+        assert "Nothing is known to have changed" in legend(read_world(memory, []))
+
+
+def test_points_are_as_large_as_they_lie_apart(room: Path) -> None:
+    with list3r.open(room) as memory:
+        cloud = read_world(memory, []).cloud
+    few = cloud.part(np.zeros_like(cloud.counts), np.minimum(cloud.counts, 20))
+    assert few.spacing == pytest.approx(cloud.spacing * np.sqrt(cloud.counts / few.counts))
+    assert point_size(np.array([0.01, 0.02]), 1.0) == pytest.approx([0.015, 0.03], rel=0.1)
+
+
+def test_the_list_has_all_words_of_a_filter_and_takes_names_as_text(room: Path) -> None:
+    with list3r.open(room) as memory:
+        world = read_world(memory, [])
+    assert filtered(world, "") == [TABLE, MUG, TWIN, CHAIR, FLOOR, WALL]
+    assert filtered(world, "Mug") == [MUG, TWIN] and filtered(world, "mug chair") == []
+    world.instances[MUG] = replace(world.instances[MUG], label="<img src=x onerror=alert(1)>", description='"><b>')
+    text = listed(world, [MUG], {}, "<i>")
+    assert "<img" not in text and "<b>" not in text and "&lt;img src=x" in text and "&lt;i&gt;" in text
 
 
 def test_the_path_is_that_of_the_camera(room: Path) -> None:
@@ -282,9 +308,9 @@ def test_a_link_to_what_is_not_there_is_told_and_breaks_nothing(two_sessions: Pa
                 with pytest.raises(List3rError):
                     viewer.show(session=session)
                 assert viewer.state == ViewState(session=1)
-            viewer.show(boxes=False)
+            viewer.show(labels=False)
             viewer.reload()
-            assert viewer.state == ViewState(session=1, boxes=False)
+            assert viewer.state == ViewState(session=1, labels=False)
         finally:
             viewer.stop()
 
@@ -309,7 +335,9 @@ def test_a_picture_of_another_page_is_no_link(viewer: Viewer) -> None:
 
 def test_search_select_and_measure_without_a_page(viewer: Viewer) -> None:
     assert viewer.find("mug on table") == [MUG, TWIN] and viewer.state.selected == MUG
-    assert viewer.find("elephant") == [] and viewer.state.selected == MUG
+    assert viewer.find("elephant") == [] and viewer.state.selected is None
+    assert viewer.panel._text.content == NOTHING_SELECTED
+    assert "Nothing found for \u201celephant\u201d" in viewer.panel._message.content
     viewer.show(selected=12345)
     assert viewer.state.selected is None
     assert ViewState.decode(viewer.link(None).split("view=")[1]) == viewer.state
@@ -353,10 +381,11 @@ def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path:
         viewer = Viewer(memory, ViewerSettings(0, clouds=CloudSettings(overview_points=1000)))
         try:
             browser.open(viewer.address)
-            browser.says("Click an instance, or search for one.")
+            browser.says(NOTHING_SELECTED)
             browser.fill("Find", "mug")
-            browser.wait(lambda: browser.run("[...document.querySelectorAll('input')].some(i => i.value === 'mug')"))
-            browser.press("Search")
+            browser.says("2 of 6; type to narrow down")
+            browser.enter()
+            browser.says("2 found for \u201cmug\u201d")
             browser.says("3 mug")
             browser.says("on 2 table")
             browser.wait(lambda: browser.run("[...document.querySelectorAll('img')].some(i => i.naturalWidth > 200)"))
@@ -366,7 +395,7 @@ def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path:
             assert memory.instance(MUG).label == "blue <b>cup</b>"
             browser.key("d")
             browser.wait(lambda: viewer.state.dark)
-            browser.wait(lambda: float(browser.picture()[700:780, 20:200].mean()) < 90)
+            browser.wait(lambda: float(browser.picture()[25:45, 1080:1160].mean()) < 90)  # the panel's head
             browser.press("Link to this view")
             found = "([...document.querySelectorAll('input')].find(i => i.value.includes('?view=')) || {}).value"
             browser.wait(lambda: browser.run(found))
@@ -388,18 +417,45 @@ def test_a_page_searches_clicks_edits_and_comes_back(browser: Browser, tmp_path:
         assert memory.instance(MUG).label == "blue <b>cup</b>"
 
 
+def test_a_row_selects_and_flies_and_an_empty_search_clears(browser: Browser, room: Path) -> None:
+    with list3r.open(room) as memory:
+        viewer = Viewer(memory, ViewerSettings(0))
+        try:
+            browser.open(viewer.address)
+            browser.says("6 of 6")
+            browser.wait(lambda: viewer.server.get_clients() and any(p.at_rest for p in viewer._pages.values()))
+            browser.fill("Find", "chair")
+            browser.says("1 of 6")
+            browser.run("document.querySelector('.things [data-thing]').click()")
+            browser.says("5 chair")
+            (client,) = viewer.server.get_clients().values()
+            browser.wait(lambda: np.allclose(client.camera.look_at, viewer.world.instances[CHAIR].center, atol=0.02))
+            assert viewer.state.selected == CHAIR and viewer.panel._typed == "chair"
+            browser.fill("Find", "elephant")
+            browser.says("0 of 6")
+            browser.enter()
+            browser.says("Nothing found for \u201celephant\u201d")
+            browser.says(NOTHING_SELECTED)
+            assert viewer.state.selected is None and "5 chair" not in browser.text()
+            viewer.show(colors="changes")
+            browser.says("Nothing is known to have changed")
+            assert browser.errors == []
+        finally:
+            viewer.stop()
+
+
 def test_a_click_on_a_thing_selects_it(browser: Browser, room: Path) -> None:
     with list3r.open(room) as memory:
         viewer = Viewer(memory, ViewerSettings(0))
         try:
             browser.open(viewer.address)
-            browser.says("Click an instance, or search for one.")
+            browser.says(NOTHING_SELECTED)
             browser.wait(viewer.server.get_clients)
             time.sleep(5.0)  # the page sets its first camera after it has connected
-            viewer.select(CHAIR, look=True)
+            viewer.select(CHAIR, turn=True)
             browser.says("5 chair")
             viewer.select(None)
-            browser.says("Click an instance, or search for one.")
+            browser.says(NOTHING_SELECTED)
             browser.wait(lambda: _selects(browser, viewer))
             assert viewer.state.selected == CHAIR
         finally:
@@ -456,16 +512,3 @@ def test_a_slow_page_draws_less_while_its_camera_moves(browser: Browser, room: P
             assert not page._nodes["/coarse"].visible and browser.errors == []
         finally:
             viewer.stop()
-
-
-def test_thin_lines_are_the_edges_of_the_boxes() -> None:
-    corners = np.array([OrientedBox(np.full(3, float(k)), np.ones(3), np.eye(3)).corners() for k in range(3)])
-    data = thin_lines(corners.astype(np.float32), np.full((3, 3), 40, np.uint8))
-    length = int.from_bytes(data[12:16], "little")
-    told, body = json.loads(data[20 : 20 + length]), data[28 + length :]
-    assert len(data) == int.from_bytes(data[8:12], "little") and len(body) % 4 == 0
-    first, _, last = (v["byteOffset"] for v in told["bufferViews"])
-    points = np.frombuffer(body, np.float32, 72, first).reshape(-1, 3)
-    edges = np.frombuffer(body, np.uint32, 72, last).reshape(-1, 2)
-    assert np.allclose(np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1), 1.0)
-    assert len(np.unique(np.sort(edges, axis=1), axis=0)) == 36

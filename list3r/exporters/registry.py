@@ -90,6 +90,9 @@ FORMATS: dict[str, Format] = {
     "rerun": Format("rerun_log", "write_rerun", (".rrd",), "recording for the Rerun viewer", package="rerun"),
     "plan": Format("plan.drawing", "write_plan", (".png", ".svg"), "plan view of the rooms as a picture"),
     "report": Format("report.page", "write_report", (".html",), "a page to read and search", of_memory=True),
+    "web": Format(
+        "web.page", "write_web", (".html",), "a page to look at: the scene, its things, a search", of_memory=True
+    ),
     "simready": Format(
         "simready.assembly",
         "write_simready",

@@ -22,7 +22,7 @@ from list3r.viewer.instance_text import described
 from list3r.viewer.layers import Layers, LayerSettings
 from list3r.viewer.link import ViewState
 from list3r.viewer.names import NameSettings, PageNames
-from list3r.viewer.panel import Panel
+from list3r.viewer.panel import NOTHING_SELECTED, Panel
 from list3r.viewer.serving import HOST, quiet, start_server
 from list3r.viewer.world import ShownCloud, ShownWorld, overview, pick, read_path, read_world
 
@@ -56,6 +56,7 @@ class Viewer:
         self._measuring: list[tuple[int, NDArray[np.float64]]] | None = None
         self._pages: dict[int, PageClouds] = {}
         self._drawn: Shown | None = None
+        self._listed: ShownWorld | None = None
         self.state = ViewState()
         self.path = read_path(memory)
         self.world = self._read(None)
@@ -116,14 +117,17 @@ class Viewer:
         with self._lock, self.server.atomic():
             s, world, unit = self.state, self.world, self.world.unit
             self._layers.highlight(world, s.colors, s.selected, visible=s.points)
-            self._layers.boxes(world, s.colors, s.selected, structure=s.structure, visible=s.boxes)
             self._layers.path(self.path, s.session, visible=s.path, unit=unit)
             self._layers.changes(world, visible=s.colors == "changes")
             self._layers.clear("relations")
             if s.selected is not None:
                 self._describe(s.selected)
             else:
-                self.panel.describe("Click an instance, or search for one.", None)
+                self.panel.describe(NOTHING_SELECTED, None)
+            self.panel.mark(s.selected)
+            if self._listed is not world:
+                self._listed = world
+                self.panel.list()
         self._draw_points()
         for page in self._open_pages():
             page.names.draw(self.world, self.state.selected, visible=self.state.labels)
@@ -131,7 +135,7 @@ class Viewer:
 
     def _draw_points(self) -> None:
         s = self.state
-        shown = Shown(self.world, s.colors, s.structure, s.points, s.boxes)
+        shown = Shown(self.world, s.colors, s.structure, s.points)
         if not shown.same(self._drawn):
             self._drawn = shown
             counts = shown.allowed()
@@ -156,25 +160,31 @@ class Viewer:
     # ------------------------------------------------------------------ what a user does
 
     def find(self, text: str) -> list[int]:
-        """Search, select the best answer and look at it; returns the ids. The panel names words that were not found."""
-        found = self.memory.find(text, 10)
-        ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
-        said = [str(x) for x in (found.counted, found.answer) if x is not None]
-        self.panel.found(ids, [f"{n} {self.world.name(n)}" for n in ids], "; ".join([*said, *found.notes]))
-        if ids:
-            self.select(ids[0], turn=True)
+        """Search, select the best answer and look at it; nothing where there is none. Returns the ids. The panel says
+        what was not understood.
+        """
+        try:
+            found = self.memory.find(text, 10)
+        except List3rError as error:
+            ids, said = [], str(error)
+        else:
+            ids = [m.instance.id for m in found if m.instance.id in self.world.instances]
+            said = "; ".join([*(str(x) for x in (found.counted, found.answer) if x is not None), *found.notes])
+        self.panel.found(text, ids, said)
+        self.select(ids[0] if ids else None, turn=True)
         return ids
 
     def select(self, instance_id: int | None, *, turn: bool = False) -> None:
-        """Select an instance, and turn all cameras to it where `turn`."""
+        """Select an instance; with `turn` all pages look at it from where it was seen best."""
         self.show(selected=instance_id)
         if turn and instance_id in self.world.instances and instance_id is not None:
             i = self.world.instances[instance_id]
-            reach = max(float(np.linalg.norm(i.box.size)), 0.1)
+            seen = self.path.of(i.best_view)
+            reach = max(2.5 * float(np.linalg.norm(i.box.size)), 0.5 * self.world.unit)
             for client in self.server.get_clients().values():
-                away = client.camera.position - client.camera.look_at
-                away = away / max(float(np.linalg.norm(away)), 1e-9)
-                client.camera.position = i.center + 3.0 * reach * away  # moves the target along
+                away = (client.camera.position if seen is None else seen) - i.center
+                far = max(float(np.linalg.norm(away)), 1e-9)
+                client.camera.position = i.center + away * min(reach / far, 1.0)  # moves the target along
                 client.camera.look_at = i.center
 
     def measure(self) -> None:

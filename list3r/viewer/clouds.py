@@ -11,15 +11,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from list3r.viewer.box_lines import box_lines
 from list3r.viewer.names import PageNames
-from list3r.viewer.world import ShownCloud, ShownWorld, close_by, color_of, colors, overview
+from list3r.viewer.world import ShownCloud, ShownWorld, close_by, colors, overview, point_size
 
 FINE = "/fine"
 """Nodes below this one are hidden while the camera of a slow page moves."""
-_BOX = 25
-"""A box of thin lines takes as long to draw as this many points."""
-_POINT_M, _COARSE_M = 0.012, 0.03
 _MOVED_SHARE = 0.1
 """The camera must move by this share of its distance to its target before detail is drawn again."""
 
@@ -35,7 +31,7 @@ class CloudSettings:
     rest_s: float = 0.5
     """All that is drawn while the camera rests takes a page no longer than this."""
     moving_s: float = 0.04
-    """The points and boxes that are drawn while it moves take no longer than this; the page itself comes on top."""
+    """The points that are drawn while it moves take no longer than this; the page itself comes on top."""
     probe_points: tuple[int, ...] = (30_000, 300_000)
     """Points whose drawing is timed; a graphics card takes a millisecond or two for the most of them."""
     probe_s: float = 0.05
@@ -54,7 +50,6 @@ class Shown:
     mode: str
     structure: bool
     points: bool
-    boxes: bool
 
     def same(self, other: Shown | None) -> bool:
         """Whether another shows the same of the same world."""
@@ -62,9 +57,9 @@ class Shown:
 
     def allowed(self) -> NDArray[np.int64]:
         """Return how many points of each instance may be drawn. Shape (K,)."""
-        objects, ids = self.world.instances, self.world.cloud.ids.tolist()
-        solid = np.array([self.points and (self.structure or objects[n].structure is None) for n in ids], bool)
-        return np.where(solid, self.world.cloud.counts, 0)
+        ids = self.world.cloud.ids.tolist()
+        drawn = np.array([self.points and (self.structure or self.world.solid(n)) for n in ids], bool)
+        return np.where(drawn, self.world.cloud.counts, 0)
 
 
 class PageClouds:
@@ -98,11 +93,10 @@ class PageClouds:
             before, self._shown = self._shown, shown
             if before is None and shown.world.cloud.counts.sum() > self._settings.never_slow_points:
                 self.seconds_a_point = self._measured(shown.world.cloud)
-            if before is None or not shown.same(replace(before, boxes=shown.boxes)):
-                self._clear("/fine/detail")
-                self._cloud("/fine/points", self._part(self._overview()), "circle", _POINT_M)
-                self._detail_at = None
-                self._draw_detail()
+            self._clear("/fine/detail")
+            self._cloud("/fine/points", self._part(self._overview()), "circle")
+            self._detail_at = None
+            self._draw_detail()
             self._draw_coarse()
             self._switch(fine=not self._moving)
 
@@ -140,19 +134,9 @@ class PageClouds:
 
     def _draw_coarse(self) -> None:
         self._clear("/coarse/points")
-        self._clear("/coarse/boxes")
-        if not self.slow or self._shown is None or self.seconds_a_point is None:
-            return
-        world, budget = self._shown.world, self._settings.moving_s / self.seconds_a_point
-        objects = [i for i in world.instances.values() if self._shown.structure or i.structure is None]
-        objects = sorted(objects, key=lambda i: -i.observations)[: int(budget / 2 / _BOX)] if self._shown.boxes else []
-        if objects:
-            ink = [color_of(world, i.id, self._shown.mode) for i in objects]
-            self._nodes["/coarse/boxes"] = box_lines(
-                self._client.scene, "/coarse/boxes", [i.box for i in objects], ink, thick=0
-            )
-        left = int(budget - _BOX * len(objects))
-        self._cloud("/coarse/points", self._part(overview(self._shown.allowed(), left)), "square", _COARSE_M)
+        if self.slow and self._shown is not None and self.seconds_a_point is not None:
+            most = int(self._settings.moving_s / self.seconds_a_point)
+            self._cloud("/coarse/points", self._part(overview(self._shown.allowed(), most)), "square")
 
     def _draw_detail(self) -> None:
         """Draw points that the overview leaves out, of the instances near the camera; structure is not among them."""
@@ -164,13 +148,13 @@ class PageClouds:
         if self._detail_at is not None and np.linalg.norm(place - self._detail_at) <= _MOVED_SHARE * reach:
             return
         self._detail_at, world = place, self._shown.world
-        objects = np.array([world.instances[n].structure is None for n in world.cloud.ids.tolist()], bool)
+        objects = np.array([world.solid(n) for n in world.cloud.ids.tolist()], bool)
         hidden = np.where(objects, world.cloud.counts - low, 0)
         most = min(self._settings.detail_points, self.most_points - low.sum())
         self._clear("/fine/detail")
         if hidden.any() and most > 0:
             cloud = world.cloud.part(low, low + close_by(world, hidden, place, int(most)))
-            self._cloud("/fine/detail", cloud, "circle", _POINT_M)
+            self._cloud("/fine/detail", cloud, "circle")
 
     # ------------------------------------------------------------------ the page
 
@@ -200,8 +184,9 @@ class PageClouds:
         without = self._fastest()
         seconds = None
         for most in self._settings.probe_points:
-            probe = self._part(overview(cloud.counts, most))
-            self._cloud("/fine/points", probe, "circle", _POINT_M)
+            part = self._part(overview(cloud.counts, most))
+            probe = replace(part, spacing=cloud.spacing)  # larger ones take longer: as when all are drawn
+            self._cloud("/fine/points", probe, "circle")
             taken = self._fastest()
             if without is None or taken is None:
                 return None
@@ -222,19 +207,21 @@ class PageClouds:
             times.append(time.perf_counter() - began)
         return min(times[1:])
 
-    def _cloud(self, name: str, cloud: ShownCloud, shape: Any, size_m: float) -> None:
+    def _cloud(self, name: str, cloud: ShownCloud, shape: Any) -> None:
+        """Draw points as large as they lie apart, so that they close surfaces: a node for each step of size."""
         self._clear(name)
-        if self._shown is not None and len(cloud.points):
-            middle = cloud.points.mean(axis=0)
-            self._nodes[name] = self._client.scene.add_point_cloud(
-                name,
-                cloud.points - middle,
-                colors(self._shown.world, cloud, self._shown.mode, None),
-                point_size=size_m * self._shown.world.unit,
-                point_shape=shape,
-                position=middle.astype(np.float64),
-            )
+        if self._shown is None or not len(cloud.points):
+            return
+        ink, middle = colors(self._shown.world, cloud, self._shown.mode, None), cloud.points.mean(axis=0)
+        size = point_size(cloud.spacing, self._shown.world.unit)
+        of_point = np.repeat(size, cloud.counts)
+        for k, s in enumerate(np.unique(size[cloud.counts > 0]).tolist()):
+            mine = of_point == s
+            self._nodes[f"{name}/{k}"] = self._client.scene.add_point_cloud(
+                f"{name}/{k}", cloud.points[mine] - middle, colors=ink[mine], point_size=s, point_shape=shape,
+                point_shading="flat", position=middle.astype(np.float64),
+            )  # fmt: skip
 
     def _clear(self, name: str) -> None:
-        if name in self._nodes:
-            self._nodes.pop(name).remove()
+        for part in [n for n in self._nodes if n.startswith(f"{name}/")]:
+            self._nodes.pop(part).remove()

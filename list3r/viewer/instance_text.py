@@ -17,8 +17,8 @@ def described(memory: SceneMemory, world: ShownWorld, instance_id: int, relation
     place = ", ".join(f"{v:.2f}" for v in i.center)
     sigma = "" if i.position_sigma_m is None else f", give or take {i.position_sigma_m:.2f} {units}"
     lines = [
-        f"### {i.id} {_plain(world.name(i.id))}",
-        _plain(i.description),
+        f"### {i.id} {plain(world.name(i.id))}",
+        plain(i.description),
         "",
         f"at {place} {units}{sigma}  ",
         f"{size} {units}  ",
@@ -29,7 +29,7 @@ def described(memory: SceneMemory, world: ShownWorld, instance_id: int, relation
     if own:
         first = {r.object: r for r in reversed(own)}  # of each other instance the most telling
         kept = [r for r in own if first[r.object] is r]
-        sentences = [f"- {r.predicate.replace('_', ' ')} {r.object} {_plain(world.name(r.object))}" for r in kept]
+        sentences = [f"- {r.predicate.replace('_', ' ')} {r.object} {plain(world.name(r.object))}" for r in kept]
         lines += ["", "**Relations**", "", *sentences[:_MOST_RELATIONS]]
         lines += [f"- and {len(sentences) - _MOST_RELATIONS} more"] if len(sentences) > _MOST_RELATIONS else []
     history = [c for c in memory.changes() if c.instance.id == i.id]
@@ -45,7 +45,7 @@ def _state(state: str, dynamic: bool) -> str:
     return ", seen moving" if dynamic else "" if state == "present" else f", {state}"
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """Text that Markdown and HTML take as it is: names are written by anybody."""
     marks = {"<": "&lt;", ">": "&gt;", "&": "&amp;", "{": "&#123;", "}": "&#125;"}
     return "".join(marks.get(c, f"\\{c}" if c in "\\`*_[]()#!|" else c) for c in text)

@@ -10,14 +10,15 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from list3r.memory.core.geometry import quat_wxyz_from_rotation
+from list3r.memory.core.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.memory.core.records import Relation
-from list3r.viewer.box_lines import box_lines
 from list3r.viewer.clouds import FINE
-from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, color_of, colors
+from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, colors, point_size
 
 _INK = (255, 200, 0)
 _MEASURED = (230, 40, 90)
+_EDGES = np.array([(a, a ^ bit) for a in range(8) for bit in (1, 2, 4) if a < a ^ bit])
+"""Pairs of corners of `OrientedBox.corners` that an edge joins."""
 
 
 @dataclass(frozen=True)
@@ -42,33 +43,28 @@ class Layers:
             node.remove()
 
     def highlight(self, world: ShownWorld, mode: str, selected: int | None, *, visible: bool) -> None:
-        """Draw the points of the selected instance once more, tinted and larger, so that the others can stay."""
+        """Draw the selected instance once more, tinted and larger, so that the others can stay, and its box."""
         self.clear("selected")
-        if selected is None or not visible:
+        if selected is None:
             return
+        nodes = [self._boxes(f"{FINE}/box", [world.instances[selected].box], [_INK])]
         cloud = world.cloud.of(selected, self._settings.selected_points)
-        if len(cloud.points):
+        if visible and len(cloud.points):
             middle = cloud.points.mean(axis=0)
-            node = self._scene.add_point_cloud(
-                f"{FINE}/selected",
-                cloud.points - middle,
-                colors(world, cloud, mode, selected),
-                point_size=0.016 * world.unit,
-                point_shape="circle",
-                position=middle.astype(np.float64),
-            )
-            self._nodes["selected"] = [node]
+            size = 1.5 * float(point_size(cloud.spacing[cloud.counts > 0], world.unit)[0])
+            nodes.append(
+                self._scene.add_point_cloud(
+                    f"{FINE}/selected", cloud.points - middle, colors(world, cloud, mode, selected), point_size=size,
+                    point_shape="circle", point_shading="flat", position=middle.astype(np.float64),
+                )
+            )  # fmt: skip
+        self._nodes["selected"] = nodes
 
-    def boxes(self, world: ShownWorld, mode: str, selected: int | None, *, structure: bool, visible: bool) -> None:
-        """Draw the oriented boxes; only that of the selected instance unless all are visible."""
-        self.clear("boxes")
-        objects = [
-            i for i in world.instances.values() if i.id == selected or (visible and (structure or i.structure is None))
-        ]
-        if objects:
-            ink = [_INK if i.id == selected else color_of(world, i.id, mode) for i in objects]
-            node = box_lines(self._scene, f"{FINE}/boxes", [i.box for i in objects], ink)
-            self._nodes["boxes"] = [node]
+    def _boxes(self, name: str, boxes: Sequence[OrientedBox], ink: Sequence[tuple[int, int, int]]) -> Any:
+        lines = np.array([b.corners() for b in boxes], np.float32)[:, _EDGES].reshape(-1, 2, 3)
+        shades = np.repeat(np.array(ink, np.uint8), len(_EDGES), axis=0)
+        ends = np.stack([shades, shades], axis=1)
+        return self._scene.add_line_segments(name, lines, ends, thickness=2.0, thickness_units="screen")
 
     def path(self, path: CameraPath, session: int | None, *, visible: bool, unit: float) -> None:
         """Draw the camera's path, through gaps broken, with frustums."""
@@ -145,7 +141,7 @@ class Layers:
         before = [(c.event.from_box, CHANGE_COLORS[c.event.kind]) for c in world.changes.values() if c.event.from_box]
         if before:
             boxes, ink = [b for b, _ in before if b is not None], [color for _, color in before]
-            nodes.append(box_lines(self._scene, "/changes/before", boxes, ink))
+            nodes.append(self._boxes("/changes/before", boxes, ink))
         self._nodes["changes"] = nodes
 
     def measured(self, ends: Sequence[NDArray[np.float64]], text: str) -> None:

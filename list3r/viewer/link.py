@@ -23,7 +23,6 @@ class ViewState:
     colors: str = COLOR_MODES[0]
     session: int | None = None
     points: bool = True
-    boxes: bool = True
     labels: bool = True
     structure: bool = True
     path: bool = False

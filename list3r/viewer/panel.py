@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from list3r.exporters.pages import thumbnail
 from list3r.memory.core.errors import List3rError
+from list3r.viewer.instance_text import plain
 from list3r.viewer.link import ViewState
+from list3r.viewer.listing import CROP_PX, MOST, filtered, legend, listed, marked
 from list3r.viewer.world import COLOR_MODES
 
 if TYPE_CHECKING:
     from list3r.viewer.app import Viewer
 
-_LAYERS = ("points", "boxes", "labels", "structure", "path")
-_KEYS: dict[str, Literal["P", "B", "L", "S", "C", "D", "M", "X", "U"]] = {
-    "points": "P", "boxes": "B", "labels": "L", "structure": "S", "path": "C", "dark": "D", "measure": "M",
+NOTHING_SELECTED = "Click a thing in the list or in the scene, or type what you look for and press Enter."
+_LAYERS = ("points", "labels", "structure", "path")
+_KEYS: dict[str, Literal["P", "L", "S", "C", "D", "M", "X", "U"]] = {
+    "points": "P", "labels": "L", "structure": "S", "path": "C", "dark": "D", "measure": "M",
     "deselect": "X", "undo": "U",
 }  # fmt: skip
 _AUTHOR = "viewer"
-_NOTHING = "-"
+_CLICKED = re.compile(r"#([0-9]{1,18})")
+"""What a click on a row of the list puts into the field."""
 _BLANK = np.full((8, 8, 3), 245, np.uint8)
 
 
@@ -31,13 +37,15 @@ class Panel:
     def __init__(self, server: viser.ViserServer, viewer: Viewer) -> None:
         self._gui, self._viewer = server.gui, viewer
         self._following = False
-        self._answers: dict[str, int] = {}
+        self._answers: tuple[str, list[int]] | None = None
+        """What was asked last, and the ids, until something else is typed."""
+        self._typed = ""
+        self._crops: dict[int, str | None] = {}
         self.pictures = viewer.memory.pictures()
         self._gui.set_panel_label(viewer.memory.path.name)
         self._search()
         self._picture = self._gui.add_image(_BLANK, visible=False)
         self._text = self._gui.add_markdown("")
-        self._message = self._gui.add_markdown("", visible=False)
         self._layers()
         self._times()
         if viewer.memory.writable:
@@ -57,12 +65,31 @@ class Panel:
         """Report an action, or why it failed."""
         self._message.content, self._message.visible = text, bool(text)
 
-    def found(self, ids: list[int], names: list[str], notes: str) -> None:
-        """Offer the answers of a search."""
-        self._answers = dict(zip(names, ids, strict=True))
-        self._choice.options = names or [_NOTHING]
-        self._choice.visible = len(names) > 1
-        self.say(notes if ids else f"Nothing found. {notes}")
+    def found(self, asked: str, ids: list[int], notes: str) -> None:
+        """List the answers of a search, in place of the last ones, or say that there are none."""
+        self._answers = (asked, ids)
+        self.say(notes if ids else f"Nothing found for \u201c{plain(asked)}\u201d. {notes}".strip())
+        self.list()
+
+    def list(self) -> None:
+        """List the answers, or else what the field's words leave of all things."""
+        world = self._viewer.world
+        if self._answers is None:
+            ids, heading = filtered(world, self._typed), f"of {len(world.instances)}; type to narrow down"
+        else:
+            ids, heading = self._answers[1], f"found for \u201c{self._answers[0]}\u201d; empty the field for all"
+        ids = [n for n in ids if n in world.instances]
+        more = f"; the first {MOST} are shown" if len(ids) > MOST else ""
+        for n in ids[:MOST]:
+            if n not in self._crops:
+                self._crops[n] = thumbnail(self._viewer.memory, n, CROP_PX) if world.solid(n) else None
+        self._things.content = listed(world, ids[:MOST], self._crops, f"{len(ids)} {heading}{more}")
+
+    def mark(self, selected: int | None) -> None:
+        """Mark the row of the selection, and explain the colours."""
+        self._mark.content = marked(selected)
+        self._legend.visible = self._viewer.state.colors == "changes"
+        self._legend.content = legend(self._viewer.world) if self._legend.visible else ""
 
     def follow(self, state: ViewState) -> None:
         """Set the controls to the view."""
@@ -79,29 +106,37 @@ class Panel:
     # ------------------------------------------------------------------ controls
 
     def _search(self) -> None:
-        text = self._gui.add_text("Find", "", hint="white mug on table; how many chairs?; 12")
-        button = self._gui.add_button("Search")
-        self._choice: Any = self._gui.add_dropdown("Answers", [_NOTHING], visible=False)
+        with self._gui.add_form(None) as form:
+            text: Any = self._gui.add_text("Find", "", hint="white mug on table; how many chairs?; 12")
+            button = self._gui.add_button("Search")
+            self._message = self._gui.add_markdown("", visible=False)
+            self._things = self._gui.add_html("")
+            self._mark = self._gui.add_html("")
 
-        @button.on_click
-        def _(_: object) -> None:
-            try:
-                self._viewer.find(text.value)
-            except List3rError as error:
-                self.say(str(error))
+        def narrow(_: object) -> None:
+            if not _CLICKED.fullmatch(text.value) and text.value != self._typed:
+                self._typed, self._answers = text.value, None
+                self.say("")
+                self.list()
 
-        def choose(_: object) -> None:
-            chosen = self._answers.get(self._choice.value)
-            if chosen is not None and chosen != self._viewer.state.selected:
-                self._viewer.select(chosen, turn=True)
+        def search(_: object) -> None:
+            clicked = _CLICKED.fullmatch(text.value)
+            if clicked:
+                text.value = self._typed
+                self._viewer.select(int(clicked[1]), turn=True)
+            elif text.value.strip():
+                self._viewer.find(text.value.strip())
 
-        self._choice.on_update(choose)
+        text.on_update(narrow)
+        form.on_submit(search)
+        button.on_click(search)
 
     def _layers(self) -> None:
         self._boxes: dict[str, Any] = {}
         usual = self._viewer.state
         with self._gui.add_folder("Show"):
             self._colors: Any = self._gui.add_dropdown("Colours", COLOR_MODES, initial_value=usual.colors)
+            self._legend = self._gui.add_html("", visible=False)
             for name in (*_LAYERS, "dark"):
                 self._boxes[name] = self._gui.add_checkbox(name.capitalize(), getattr(usual, name))
 

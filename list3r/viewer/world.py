@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.api import SceneMemory
+from list3r.exporters.components import point_spacing
 from list3r.exporters.palette import instance_color, structure_color
-from list3r.memory.core.records import Instance
+from list3r.memory.core.records import BestView, Instance
 from list3r.queries.changes import Changed
 
 CHANGE_COLORS = {"added": (40, 160, 80), "moved": (235, 140, 30), "removed": (210, 50, 60)}
 COLOR_MODES = ("own colour", "instance", "changes")
-_UNCHANGED = (190, 190, 195)
+UNCHANGED = (190, 190, 195)
 _SELECTED = (255, 200, 0)
 _RAY_RADIUS = 0.008
 """Radius of a ray as a share of the points' depth: about the size at which they are drawn."""
@@ -23,7 +24,7 @@ _RAY_RADIUS = 0.008
 @dataclass(frozen=True)
 class ShownCloud:
     """Surface points of many instances, concatenated; each in random order, so that any prefix is a coarser cloud. 15
-    bytes a point, so that tens of millions fit.
+    bytes a point, so that tens of millions fit. Id 0 stands for what belongs to no instance.
     """
 
     points: NDArray[np.float32]
@@ -34,6 +35,8 @@ class ShownCloud:
     """Ids of the instances. Shape (K,)."""
     counts: NDArray[np.int64]
     """How many of the points are each instance's. Shape (K,)."""
+    spacing: NDArray[np.float64]
+    """How far the points of each lie from each other, world units. Shape (K,)."""
 
     @property
     def owner(self) -> NDArray[np.int64]:
@@ -45,7 +48,8 @@ class ShownCloud:
         counts = np.maximum(high - low, 0)
         first = np.cumsum(self.counts) - self.counts + low
         place = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
-        return ShownCloud(self.points[place], self.rgb[place], self.ids, counts)
+        wider = np.sqrt(self.counts / np.maximum(counts, 1))
+        return ShownCloud(self.points[place], self.rgb[place], self.ids, counts, self.spacing * wider)
 
     def of(self, instance_id: int, most: int) -> ShownCloud:
         """Return the first points of one instance."""
@@ -68,6 +72,13 @@ class CameraPath:
     rotation: NDArray[np.float64]
     """R_world_cam. Shape (F, 3, 3)."""
 
+    def of(self, view: BestView | None) -> NDArray[np.float64] | None:
+        """Return where the camera was in a frame, world, shape (3,); None where it is not known."""
+        if view is None:
+            return None
+        here = np.flatnonzero((self.session == view.session_id) & (self.frame == view.frame_index))
+        return self.position[here[0]] if len(here) else None
+
 
 @dataclass(frozen=True)
 class ShownWorld:
@@ -80,6 +91,11 @@ class ShownWorld:
     unit: float
     """About a metre in world units."""
 
+    def solid(self, instance_id: int) -> bool:
+        """Tell whether an id is a thing's: no structure, and not 0."""
+        i = self.instances.get(instance_id)
+        return i is not None and i.structure is None
+
     def name(self, instance_id: int) -> str:
         """Return the name of an instance."""
         i = self.instances[instance_id]
@@ -89,11 +105,11 @@ class ShownWorld:
 def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
     """Return the present world of a memory; `changes` are those to colour."""
     shown = [i for i in memory.instances(structure=None) if i.state != "removed" and np.isfinite(i.aabb).all()]
-    cloud = _cloud(memory, [i.id for i in shown])
     newest: dict[int, Changed] = {}
     for change in changes:
         newest.setdefault(change.instance.id, change)
-    return ShownWorld({i.id: i for i in shown}, cloud, newest, 1.0 if memory.units == "m" else _unit(shown))
+    there = {i.id: i for i in shown}
+    return ShownWorld(there, _cloud(memory), newest, 1.0 if memory.units == "m" else _unit(shown))
 
 
 def _unit(instances: list[Instance]) -> float:
@@ -103,16 +119,18 @@ def _unit(instances: list[Instance]) -> float:
     return 1.0 if 1.0 < extent < 100.0 else max(extent, 1e-9) / 5.0
 
 
-def _cloud(memory: SceneMemory, ids: list[int]) -> ShownCloud:
-    points, rgb = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
-    for n in ids:
-        support = memory.support(n)
-        finite = np.flatnonzero(np.isfinite(support.points).all(axis=1))
-        order = np.random.default_rng(n).permutation(finite)
-        points.append(support.points[order].astype(np.float32))
-        rgb.append(support.rgb[order])
+def _cloud(memory: SceneMemory) -> ShownCloud:
+    points, rgb, spacing = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)], []
+    surfaces = memory.surfaces()
+    for n, surface in surfaces.items():
+        order = np.random.default_rng(n).permutation(len(surface.points))
+        points.append(surface.points[order])
+        rgb.append(surface.rgb[order])
+        spacing.append(point_spacing(surface.points) if len(order) else 0.0)
     counts = np.array([len(p) for p in points[1:]], np.int64)
-    return ShownCloud(np.concatenate(points), np.concatenate(rgb), np.array(ids, np.int64), counts)
+    return ShownCloud(
+        np.concatenate(points), np.concatenate(rgb), np.array(list(surfaces), np.int64), counts, np.array(spacing)
+    )
 
 
 def read_path(memory: SceneMemory) -> CameraPath:
@@ -147,13 +165,20 @@ def close_by(world: ShownWorld, hidden: NDArray[np.int64], place: NDArray[np.flo
     """Return how many hidden points of each instance to add: nearest instances to a place first, at most `most` in all;
     `hidden` is how many each has. Shape (K,).
     """
-    boxes = np.array([world.instances[n].aabb for n in world.cloud.ids.tolist()]).reshape(-1, 2, 3)
+    nowhere = np.full((2, 3), np.inf)
+    there = [world.instances[n].aabb if n in world.instances else nowhere for n in world.cloud.ids.tolist()]
+    boxes = np.array(there).reshape(-1, 2, 3)
     gap = np.linalg.norm(np.maximum(0.0, np.maximum(boxes[:, 0] - place, place - boxes[:, 1])), axis=1)
     order = np.argsort(gap, kind="stable")
     before = np.cumsum(hidden[order]) - hidden[order]
     chosen = np.zeros_like(hidden)
     chosen[order] = np.clip(most - before, 0, hidden[order])
     return chosen
+
+
+def point_size(spacing: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
+    """Return how large to draw points so that they close a surface, in steps of a fifth. Any shape."""
+    return np.asarray(1.2 ** np.round(np.log(np.clip(1.5 * spacing, 0.005 * unit, 0.05 * unit)) / np.log(1.2)))
 
 
 # ---------------------------------------------------------------------------------------------- colours
@@ -166,6 +191,9 @@ def colors(world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None
     else:
         each = np.array([color_of(world, n, mode) for n in cloud.ids.tolist()], np.uint8).reshape(-1, 3)
         out = np.repeat(each, cloud.counts, axis=0)
+        if mode == "changes":  # what is as it was keeps its light and shade, else nothing could be told in it
+            same = (out == UNCHANGED).all(axis=1)
+            out[same] = (0.5 * cloud.rgb[same].mean(axis=1, keepdims=True) + 70).astype(np.uint8)
     if selected is not None:
         mine = cloud.owner == selected
         out[mine] = np.round(0.5 * out[mine] + 0.5 * np.array(_SELECTED)).astype(np.uint8)
@@ -176,9 +204,8 @@ def color_of(world: ShownWorld, instance_id: int, mode: str) -> tuple[int, int, 
     """Return the colour of an instance's box and, unless points have their own, of its points."""
     if mode == "changes":
         change = world.changes.get(instance_id)
-        return _UNCHANGED if change is None else CHANGE_COLORS.get(change.event.kind, _UNCHANGED)
-    structure = world.instances[instance_id].structure is not None
-    return structure_color(instance_id) if structure else instance_color(instance_id)
+        return UNCHANGED if change is None else CHANGE_COLORS.get(change.event.kind, UNCHANGED)
+    return (instance_color if world.solid(instance_id) else structure_color)(instance_id)
 
 
 # ---------------------------------------------------------------------------------------------- picking
@@ -198,7 +225,7 @@ def pick(
     near = np.flatnonzero((depth > 0) & (aside < _RAY_RADIUS * depth))
     first = int(near[np.argmin(depth[near])]) if len(near) else -1
     owner = int(shown.ids[np.searchsorted(np.cumsum(shown.counts), first, side="right")]) if first >= 0 else -1
-    if first >= 0 and world.instances[owner].structure is None:
+    if first >= 0 and world.solid(owner):
         return owner, shown.points[first].astype(np.float64)
     reach = float(depth[first]) if first >= 0 else np.inf
     objects = [i for i in world.instances.values() if i.structure is None or first < 0]

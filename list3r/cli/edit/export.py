@@ -91,7 +91,7 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, an HTML
-    report, or a folder: models of COLMAP and nerfstudio, a pack for a language model.
+    report, a page with the scene (web), or a folder: models of COLMAP and nerfstudio, a pack for a language model.
 
     Example: list3r export house.l3r --to usd --out house.usdc
     """

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import base64
 import html
-import io
-import json
 import re
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -17,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from list3r.exporters.output import replacing
+from list3r.exporters.pages import embedded, numbers, thumbnails
 from list3r.memory.core.description.printable import shown
-from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -50,18 +47,12 @@ def write_report(memory: SceneMemory, path: str | Path, settings: ReportSettings
             "instances": [_instance(i) for i in instances],
             "relations": _relations(memory, instances),
             "changes": [_change(c) for c in memory.changes()],
-            "crops": _crops(memory, instances, settings),
+            "crops": thumbnails(memory, instances, settings.crops, settings.crop_px),
         }
-        parts = {"title": html.escape(shown(memory.path.name)), "plan": _plan(memory), "data": _embedded(data)}
+        parts = {"title": html.escape(shown(memory.path.name)), "plan": _plan(memory), "data": embedded(data)}
         text = re.sub(r"\{(title|plan|data)\}", lambda found: parts[found[1]], page)
         temporary.write_text(text, encoding="utf-8")
     return (path,)
-
-
-def _embedded(data: object) -> str:
-    """Return JSON that ends no script element and opens no comment."""
-    text = json.dumps(data, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _about(memory: SceneMemory) -> dict[str, Any]:
@@ -77,18 +68,14 @@ def _instance(i: Instance) -> dict[str, Any]:
         "label": i.label,
         "description": i.description,
         "structure": i.structure,
-        "center": _numbers(i.center),
-        "size": _numbers(i.box.size),
+        "center": numbers(i.center),
+        "size": numbers(i.box.size),
         "color": [int(v) for v in i.color_rgb],
         "confidence": round(float(i.confidence), 2),
         "frames": i.observations,
-        "seen_s": _numbers([i.first_seen_s, i.last_seen_s]),
+        "seen_s": numbers([i.first_seen_s, i.last_seen_s]),
         "state": "moving" if i.dynamic else i.state,
     }
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    return [round(float(v), 3) + 0.0 if np.isfinite(v) else None for v in values]
 
 
 def _relations(memory: SceneMemory, instances: list[Instance]) -> list[tuple[int, str, int, float]]:
@@ -119,22 +106,3 @@ def _plan(memory: SceneMemory) -> str:
     with tempfile.TemporaryDirectory() as folder:
         picture = memory.export("plan", Path(folder) / "plan.png")[0].read_bytes()
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
-
-
-def _crops(memory: SceneMemory, instances: list[Instance], settings: ReportSettings) -> dict[str, str]:
-    """Return small JPEGs by id, of instances that a stored picture shows."""
-    from PIL import Image
-
-    objects = [i for i in instances if i.structure is None and i.state != "removed"]
-    out = {}
-    for i in sorted(objects, key=lambda i: (-i.observations, i.id))[: settings.crops]:
-        try:
-            crop = memory.picture(i.id).crop()
-        except OptionError:  # no stored picture shows it
-            continue
-        image = Image.fromarray(np.ascontiguousarray(crop))
-        image.thumbnail((settings.crop_px, settings.crop_px))
-        buffer = io.BytesIO()
-        image.save(buffer, format="JPEG", quality=80)
-        out[str(i.id)] = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return out

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ def _surface(measured: NDArray[np.float32] | None, instance: Instance) -> Instan
     """Return the support points inside the box, as deriving the box left strays out; those just outside are moved to
     its side, so that a thing is never nearer than its box.
     """
-    points = None if measured is None else inside_box(measured.astype(np.float64), instance)
+    points = None if measured is None else measured[inside_box(measured, instance)].astype(np.float64)
     if points is None or len(points) == 0:
         return InstanceSurface(None, instance)
     low, high = instance.aabb
@@ -104,11 +104,11 @@ def _surface(measured: NDArray[np.float32] | None, instance: Instance) -> Instan
     return InstanceSurface(points, instance)
 
 
-def inside_box(points: NDArray[np.float64], instance: Instance) -> NDArray[np.float64]:
-    """Return the points that lie in the box of an instance, or just outside. Shape (N, 3) -> (M, 3)."""
+def inside_box(points: NDArray[np.floating[Any]], instance: Instance) -> NDArray[np.bool_]:
+    """Tell which points lie in the box of an instance, or just outside. Shape (N, 3) -> (N,)."""
     slack = _SLACK * float(np.max(instance.box.size)) + 1e-9
     low, high = instance.aabb
-    return np.asarray(points[np.all((points >= low - slack) & (points <= high + slack), axis=1)])
+    return np.asarray(np.all((points >= low - slack) & (points <= high + slack), axis=1))
 
 
 _FACES = np.array([p for p in np.ndindex(3, 3, 3) if p != (1, 1, 1)], dtype=np.float64) * 0.5 - 0.5

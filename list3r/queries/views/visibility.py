@@ -194,7 +194,8 @@ def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], flo
     """
     from scipy.spatial import cKDTree
 
-    points = inside_box(store.surfaces.of_instance(instance).points.astype(np.float64), instance)
+    known = store.surfaces.of_instance(instance).points
+    points = known[inside_box(known, instance)].astype(np.float64)
     if len(points) < _FEW:
         side = np.linspace(-0.5, 0.5, _FEW)
         grid = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
