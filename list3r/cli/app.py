@@ -30,6 +30,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "build.exchange": ("convert", "import"),
     "ask.memory": ("info", "list", "show"),
     "ask.query": ("query",),
+    "ask.rooms": ("rooms",),
     "ask.picture": ("picture",),
     "edit.commands": ("merges", "undo", "merge", "split", "label", "delete"),
     "models.embed": ("embed",),
@@ -57,7 +58,7 @@ FUNCTIONS = {
 """Functions and groups of commands that have another name than their command."""
 GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
-    "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config", "serve"),
+    "Ask": ("info", "list", "show", "query", "rooms", "picture", "view", "mcp", "ask-config", "serve"),
     "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
     "Export": ("export", "catalog"),
     "Evaluate": ("eval",),

@@ -18,6 +18,7 @@ from list3r.cli.ask.output import (
     MinConfidence,
     MinSize,
     Pose,
+    Room,
     SessionOption,
     State,
     Structure,
@@ -44,6 +45,7 @@ class FilterArguments:
     min_confidence: MinConfidence = None
     state: State = None
     component: Component = None
+    room: Room = None
     structure: Structure = False
 
     def options(self) -> FilterOptions:
@@ -56,6 +58,7 @@ class FilterArguments:
             "min_confidence": self.min_confidence or 0.0,
             "state": self.state,
             "component": self.component,
+            "room": self.room,
             "structure": self.structure,
         }
 
