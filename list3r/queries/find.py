@@ -12,6 +12,7 @@ from list3r.memory.core.description.spelling import adjectives, split_words
 from list3r.memory.core.description.words import kind_word, vocabulary
 from list3r.memory.core.errors import OptionError, UnknownIdError
 from list3r.memory.core.records import Instance
+from list3r.memory.library.rooms.naming import title
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
@@ -22,7 +23,7 @@ from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
 from list3r.queries.finding.words import STRUCTURE, no_such_words
 from list3r.queries.match import Match, Matches, checked_count, checked_instance, of_one_state
 from list3r.queries.relations import Place, viewer_from
-from list3r.queries.rooms import room_of, rooms_of, title
+from list3r.queries.rooms import room_of, rooms_of
 from list3r.queries.views.gather import Gathered, gather, is_large, sample
 
 _EQUAL = 0.02

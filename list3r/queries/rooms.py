@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from list3r.memory.core.description.spelling import split_words
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Doorway, Room
-from list3r.memory.library.rooms.naming import named_rooms
+from list3r.memory.library.rooms.naming import named_rooms, title
 from list3r.memory.store.store import Store
 
 
@@ -52,11 +52,6 @@ def _words(name: str) -> list[str]:
 def room_of(store: Store, instance_id: int) -> Room | None:
     """Return the room that an instance is in; None for one in none."""
     return next((r for r in named_rooms(store) if instance_id in r.instances), None)
-
-
-def title(room: Room) -> str:
-    """Name a room by its number and its name."""
-    return f"room {room.id}" + (f" ({room.name})" if room.name else "")
 
 
 def room_path(store: Store, start: int | str, end: int | str) -> RoomPath:

@@ -71,7 +71,7 @@ def rooms(
 
 
 def _print_way(scene: SceneMemory, start: str, end: str, json: bool) -> None:
-    from list3r.queries.rooms import title
+    from list3r.memory.library.rooms.naming import title
 
     way = scene.room_path(start, end)
     if json:

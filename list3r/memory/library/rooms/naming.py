@@ -58,6 +58,11 @@ def named_rooms(store: Store) -> list[Room]:
     return out
 
 
+def title(room: Room) -> str:
+    """Name a room by its number and its name."""
+    return f"room {room.id}" + (f" ({room.name})" if room.name else "")
+
+
 def _by_things(things: Sequence[tuple[int, str]]) -> tuple[str, str] | None:
     """Return what labelled things make of a room, with those that tell it; None where none does."""
     best: tuple[tuple[int, int], str, str] | None = None
