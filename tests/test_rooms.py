@@ -89,7 +89,7 @@ def test_an_outline_goes_round_its_cells() -> None:
 
 
 def room(n: int, x: float, instances: tuple[int, ...] = ()) -> Room:
-    return Room(n, 0, 0.0, SQUARE + (x, 0.0), 12.0, "", instances)
+    return Room(n, 0, 0.0, SQUARE + np.array([x, 0.0]), 12.0, "", instances)
 
 
 def test_ids_stay_with_the_ground_that_they_cover_and_are_not_given_again() -> None:
