@@ -191,8 +191,8 @@ def _named_as_before(rooms: Sequence[Room], doorways: Sequence[Doorway], known: 
             last += 1
             ids[room.id] = last
     named = sorted((replace(r, id=ids[r.id]) for r in rooms), key=lambda r: r.id)
-    ends = [(*sorted((ids[d.a], ids[d.b])), d) for d in doorways]
-    return Rooms(named, [replace(d, a=a, b=b) for a, b, d in ends], last)
+    moved = [replace(d, a=min(ids[d.a], ids[d.b]), b=max(ids[d.a], ids[d.b])) for d in doorways]
+    return Rooms(named, moved, last)
 
 
 def _overlap(a: Room, b: Room) -> float:
