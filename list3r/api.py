@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from list3r.exporters.tables import Table
     from list3r.frames.options import SourceOptions
     from list3r.memory.core.geometry import Sim3
-    from list3r.memory.core.records import FrameRow, Relation, Session, Support
+    from list3r.memory.core.records import Doorway, FrameRow, Relation, Room, Session, Support
     from list3r.pipeline.request import BuildRequest, RunArguments
     from list3r.pipeline.settings import BuildSettings
     from list3r.queries.changes import Changed
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from list3r.queries.measure import InstanceDistance
     from list3r.queries.pictures import InstancePicture, KeyframePicture
     from list3r.queries.relations import Place, Relations
+    from list3r.queries.rooms import RoomPath
     from list3r.queries.seen import Sightings
     from list3r.queries.views.camera import PosedCamera
 
@@ -395,7 +396,7 @@ class SceneMemory(MemoryEdits):
         """Return the k things nearest to a point (x, y, z) or to an instance, or those that words name best.
 
         Distances are between surfaces and between centres. For the filters (`structure`, `min_confidence`, `state`,
-        `label`, `color`, `min_size`, `max_size`, `component`, `dynamic`) see `list3r.queries.match.Filters`.
+        `label`, `color`, `min_size`, `max_size`, `component`, `dynamic`, `room`) see `list3r.queries.match.Filters`.
 
             >>> memory.nearest((0.5, 1.2, 0.8), k=3, color="red", max_distance=1.0)
         """
@@ -594,6 +595,28 @@ class SceneMemory(MemoryEdits):
         from list3r.queries.measure import measure
 
         return measure(self.store, id_of(a), id_of(b))
+
+    @_alone
+    def rooms(self) -> list[Room]:
+        """Return the rooms, with their outlines, what is in each, and names by what stands in them or by a person.
+
+        >>> [(room.id, room.name, round(room.area, 1)) for room in memory.rooms()]
+        """
+        from list3r.queries.rooms import rooms
+
+        return rooms(self.store)
+
+    @_alone
+    def doorways(self) -> list[Doorway]:
+        """Return the doorways between rooms."""
+        return self.store.rooms.doorways()
+
+    @_alone
+    def room_path(self, start: int | str, end: int | str) -> RoomPath:
+        """Return the way through the fewest doorways between two rooms, by ids or names. Raises `OptionError`."""
+        from list3r.queries.rooms import room_path
+
+        return room_path(self.store, start, end)
 
     @_alone
     def path_between(self, start: int | Instance, end: int | Instance, *, structure: bool = True) -> Relations:

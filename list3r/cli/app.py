@@ -33,6 +33,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "ask.memory": ("info", "list", "show"),
     "ask.query": ("find", "nearest", "relations", "similar", "within", "seen", "path"),
     "ask.changes": ("changes",),
+    "ask.rooms": ("rooms",),
     "ask.picture": ("picture",),
     "edit.commands": ("edit",),
     "edit.export": ("export",),
@@ -51,7 +52,7 @@ FUNCTIONS = {"list": "list_instances", "import": "import_map", "eval": "measures
 """Functions and groups of commands that have another name than their command."""
 FIRST: dict[str, tuple[str, ...]] = {
     "Build": ("build", "update"),
-    "Look": ("info", "list", "show", "view"),
+    "Look": ("info", "list", "show", "rooms", "view"),
     "Ask": ("find", "nearest", "relations", "similar", "changes"),
     "Change and use": ("edit", "export"),
 }

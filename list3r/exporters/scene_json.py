@@ -15,6 +15,7 @@ from list3r.exporters.output import replacing, units
 from list3r.memory.core.geometry import quat_wxyz_from_rotation
 from list3r.memory.core.records import Instance, Relation
 from list3r.memory.library.labels import label_source
+from list3r.memory.library.rooms.naming import named_rooms
 from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
 
@@ -73,8 +74,36 @@ def scene_dict(store: Store) -> dict[str, Any]:
             for i in instances
         ],
         "relations": [_relation(r, decimals) for r in relations],
+        "floors": _floors(store, decimals),
+        "doorways": [
+            {
+                "rooms": [d.a, d.b],
+                "position": _vector(d.position, decimals),
+                "width": _number(d.width, decimals),
+            }
+            for d in store.rooms.doorways()
+        ],
         "aliases": [{"id": k, "instance": v} for k, v in store.ids.aliases().items()],
     }
+
+
+def _floors(store: Store, decimals: int) -> list[dict[str, Any]]:
+    """Return the storeys of the building from the lowest, each with its rooms and what is in these."""
+    floors: dict[int, dict[str, Any]] = {}
+    for room in named_rooms(store):
+        entry = {
+            "id": room.id,
+            "name": room.name,
+            "reason": room.reason,
+            "partial": room.partial or None,
+            "floor_z": _number(room.floor_z, decimals),
+            "area": _number(room.area, decimals),
+            "outline": [_vector(corner, decimals) for corner in room.outline],
+            "instances": list(room.instances),
+        }
+        floor = floors.setdefault(room.floor, {"floor": room.floor, "z": entry["floor_z"], "rooms": []})
+        floor["rooms"].append(entry)
+    return [floors[n] for n in sorted(floors)]
 
 
 def _deviations(store: Store) -> dict[str, float]:

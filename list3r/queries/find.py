@@ -12,16 +12,18 @@ from list3r.memory.core.description.spelling import adjectives, split_words
 from list3r.memory.core.description.words import kind_word, vocabulary
 from list3r.memory.core.errors import OptionError, UnknownIdError
 from list3r.memory.core.records import Instance
+from list3r.memory.library.rooms.naming import title
 from list3r.memory.store.store import Store
 from list3r.queries.changes import changes
 from list3r.queries.finding.free_words import WordEncoder, like, named_by_vectors
-from list3r.queries.finding.grammar import Phrase, Question, parse
+from list3r.queries.finding.grammar import IN_ROOM, Clause, Phrase, Question, parse
 from list3r.queries.finding.naming import SYNONYM, called, looser, name_score, tiers, why_named
 from list3r.queries.finding.ordering import ordered, sized
 from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
 from list3r.queries.finding.words import STRUCTURE, no_such_words
 from list3r.queries.match import Match, Matches, checked_count, checked_instance, of_one_state
 from list3r.queries.relations import Place, viewer_from
+from list3r.queries.rooms import room_of, rooms_of
 from list3r.queries.views.gather import Gathered, gather, is_large, sample
 
 _EQUAL = 0.02
@@ -96,7 +98,7 @@ def find(
         found = _labelled(store, question, k) or _asked(store, question, k, viewpoint, encoder)
     if question.kind == "count":
         found.counted = found.total if found.exact else 0
-    if question.kind == "where" and found.exact:
+    if question.kind in ("where", "room") and found.exact:
         found[:] = [_placed(store, m) for m in found]
     found.mentioned |= {m.instance.id: m.score for m in found}
     found.notes = tuple(dict.fromkeys((*found.notes, *question.notes)))
@@ -187,7 +189,8 @@ def _placed(store: Store, m: Match) -> Match:
     """Return a match whose reason tells what holds it and when it was seen last."""
     i = m.instance
     held = [r for r in store.relations.all(i.id, None, None) if r.predicate in _HOLDING]
-    parts = [m.reason]
+    room = room_of(store, i.id)
+    parts = [m.reason] if room is None or f"in {title(room)}" in m.reason else [m.reason, f"in {title(room)}"]
     if held:
         best = max(held, key=lambda r: r.confidence)
         o = store.instances.get(best.object)
@@ -274,11 +277,14 @@ def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
     if phrase.size is not None:
         found = sized(search, found, phrase)
     for clause in phrase.where:
-        if not found:
+        if not found and clause.predicates != (IN_ROOM,):
             # The rest is searched all the same, so that all words without a match are named.
             _meaning(search, clause.object)
             if clause.other:
                 _meaning(search, clause.other)
+            continue
+        if clause.predicates == (IN_ROOM,):
+            found = _in_room(search, found, clause)
             continue
         ends = _meaning(search, clause.object), _meaning(search, clause.other) if clause.other else []
         if not clause.negated:
@@ -295,6 +301,20 @@ def _meaning(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:
         to = _meaning(search, phrase.order.to) if phrase.order.to is not None else []
         found = ordered(search, found, phrase.order, to)
     return found
+
+
+def _in_room(search: PhraseSearch, found: list[PhraseMatch], clause: Clause) -> list[PhraseMatch]:
+    """Return what is in the rooms of a name, or what is not; all of it, with a note, where no room is called so."""
+    try:
+        rooms = rooms_of(search.store, clause.object.text)
+    except OptionError as error:
+        search.notes.append(f"{error}: {clause.object.text!r} was left out")
+        return found
+    home = {n: r for r in rooms for n in r.instances}
+    if clause.negated:
+        return [c for c in found if c.instance.id not in home]
+    inside = [c for c in found if c.instance.id in home]
+    return [replace(c, reasons=(*c.reasons, f"in {title(home[c.instance.id])}")) for c in inside]
 
 
 def _numbered(search: PhraseSearch, phrase: Phrase) -> list[PhraseMatch]:

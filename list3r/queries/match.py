@@ -15,6 +15,7 @@ from list3r.memory.core.records import BestView, Instance
 from list3r.memory.store.store import Store
 from list3r.queries.answers import Answers
 from list3r.queries.finding.words import is_colored, is_named, wanted_words
+from list3r.queries.rooms import rooms_of
 
 STATES = ("present", "moved", "removed", "added", "unseen", "any")
 """What may be asked for; without a state all things answer but those that are known to be gone."""
@@ -87,6 +88,7 @@ class FilterOptions(TypedDict, total=False):
     max_size: float | None
     component: int | None
     dynamic: bool | None
+    room: int | str | None
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,16 @@ class Filters:
     """Only this connected component, see `Instance.component`."""
     dynamic: bool | None = None
     """Only what was seen moving (True), or what was not (False)."""
+    among: frozenset[int] | None = None
+    """Only these ids: what is in a room."""
+
+    @staticmethod
+    def of(store: Store, options: FilterOptions) -> Filters:
+        """Return the filters of a question. Raises `OptionError` for a room that there is not."""
+        chosen = dict(options)
+        room = chosen.pop("room", None)
+        inside = None if room is None else frozenset(n for r in rooms_of(store, room) for n in r.instances)  # type: ignore[arg-type]
+        return Filters(**chosen, among=inside)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         check_share("min_confidence", self.min_confidence)
@@ -147,6 +159,7 @@ class Filters:
             and (self.max_size is None or size <= self.max_size)
             and (self.component is None or i.component == self.component)
             and (self.dynamic is None or i.dynamic == self.dynamic)
+            and (self.among is None or i.id in self.among)
         )
 
 

@@ -67,12 +67,12 @@ def nearest(
     origin = None if instance_id is None else checked_instance(store, instance_id)
     place = None if point is None else checked_point(point, "point")
     if words is None:
-        near = _near(store, origin, place, k, max_distance, Filters(**options))
+        near = _near(store, origin, place, k, max_distance, Filters.of(store, options))
         return Matches(_match(i, distance, "", origin, place) for distance, i in near)
     from list3r.queries.by_words import named_by, names_structure, only_common
 
     options["structure"] = options.get("structure", False) or names_structure(words)
-    filters = Filters(**options)
+    filters = Filters.of(store, options)
     if is_large(store) and (origin is not None or place is not None) and only_common(store, words):
         filters = replace(filters, label=" ".join([*([filters.label] if filters.label else []), words]))
         near = _near(store, origin, place, k, max_distance, filters)

@@ -95,7 +95,7 @@ def visible(
     check_share("min_visible", min_visible)
     if max_depth is not None and not 0.0 < max_depth < float("inf"):
         raise OptionError(f"max_depth {max_depth} must be a finite length above 0")
-    filters = Filters(**options)
+    filters = Filters.of(store, options)
     followed = _followed(store, camera)
     found = []
     for s in look(store, camera, in_front(store, camera, max_depth), max_depth=max_depth, occlusion=occlusion):

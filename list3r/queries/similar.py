@@ -42,7 +42,7 @@ def similar(
         raise OptionError("a vector needs the name of its embedding space, model@revision/dim")
     if part is not None and (vector is None or np.shape(vector) != (part,)):
         raise OptionError(f"part {part} needs a vector of {part} numbers")
-    filters = Filters(**options)
+    filters = Filters.of(store, options)
     origin = None if instance_id is None else checked_instance(store, instance_id)
     index = VectorIndex.of(store, space)
     query = index.vector(store, origin.id) if origin is not None else vector

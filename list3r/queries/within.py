@@ -36,7 +36,7 @@ def within(
     of the region; for a camera see `seen.visible`: with `occlusion` it leaves out what other things hide. The most
     inside come first. For the filters see `Filters`. Raises `OptionError` for a region that makes no sense.
     """
-    filters = Filters(**options)
+    filters = Filters.of(store, options)
     box, sphere = lower is not None or upper is not None, center is not None or radius is not None
     if box + sphere + (camera is not None) != 1:
         raise OptionError(

@@ -41,6 +41,9 @@ State = Annotated[
     ),
 ]
 Component = Annotated[int | None, typer.Option("--component", help="Only this connected component.")]
+Room = Annotated[
+    str | None, typer.Option("--room", metavar="ROOM", help="Only what is in this room: its number or name.")
+]
 View = Annotated[
     int | None, typer.Option("--view", metavar="FRAME", help="Only instances that the camera of this frame sees.")
 ]

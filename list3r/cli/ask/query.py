@@ -66,6 +66,7 @@ def nearest(
     min_confidence: opt.MinConfidence = None,
     state: opt.State = None,
     component: opt.Component = None,
+    room: opt.Room = None,
     structure: opt.Structure = False,
     catalog: opt.Catalogue = None,
     at: AtOption = None,
@@ -81,13 +82,13 @@ def nearest(
         raise OptionError("give a place: an ID, --point x,y,z, or --words such as mug")
     place = None if point is None else parse_point(point, "--point")
     if catalog is not None:
-        many.refuse({"--max-distance": max_distance, "--component": component, "--at": at})
+        many.refuse({"--max-distance": max_distance, "--component": component, "--room": room, "--at": at})
         many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size})
         chosen = many.filters(min_confidence, structure=structure, state=state)
         many.answer(catalog, memory, lambda c, name: many.nearest(c, name, instance_id, place, words, k, chosen), json)
         return
     of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
-    of_look |= {"state": state, "component": component}
+    of_look |= {"state": state, "component": component, "room": room}
     with open_memory(memory, min_confidence, at) as scene:
         from list3r.queries.nearest import nearest as ask
 

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -29,11 +29,13 @@ from list3r.exporters.tags import TagTarget, place_tags
 from list3r.memory.core.description.printable import shown
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Instance
+from list3r.memory.library.rooms.naming import named_rooms
 from list3r.memory.library.world.gravity import gravity_of
 from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
 
 _INK, _GREY, _LINE = "#262a34", "#787c86", "#cdcfd4"
+_ROOM = "#2f5fa8"
 _START, _END, _LOOP = "#168c64", "#c43048", "#7654be"
 _STYLE: Any = {"font.family": "sans-serif", "svg.fonttype": "none", "svg.hashsalt": "list3r", "hatch.linewidth": 0.5}
 _DPI = 100
@@ -96,6 +98,8 @@ def plan_figure(store: Store, component: Component, settings: PlanSettings | Non
     picture = picture_from_above(view, *([supports[i.id] for i in layer] for layer in layers))
     ax.imshow(picture, extent=(view.low[0], view.high[0], view.low[1], view.high[1]), zorder=1)
     draw_grid(ax, view, str(lengths_of(store)))
+    if component.id == min((c.component for c in store.chunks.all()), default=0):
+        _draw_rooms(ax, view, store)
     _draw_boxes(ax, view, instances, {i.id for i in tagged})
     _draw_tracks(ax, view, store, component)
     _draw_loops(ax, view, loop_ends(store, component))
@@ -186,6 +190,20 @@ def footprints(view: PlanView, instances: list[Instance]) -> NDArray[np.float64]
 def _color(instance_id: int, alpha: float = 1.0) -> tuple[float, float, float, float]:
     r, g, b = instance_color(instance_id)
     return r / 255, g / 255, b / 255, alpha
+
+
+def _draw_rooms(ax: Axes, view: PlanView, store: Store) -> None:
+    """Draw outlines and names of rooms, dashed where a room is partial, and a diamond in each doorway."""
+    for room in named_rooms(store):
+        corners = view.on_page(np.column_stack([room.outline, np.full(len(room.outline), room.floor_z)]))
+        style = (0, (4, 3)) if room.partial else "-"
+        ax.add_patch(Polygon(corners, fill=False, ec=_ROOM, lw=1.4, ls=style, alpha=0.8, zorder=2.5))
+        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        name = shown(room.name or f"room {room.id}")
+        halo = [matplotlib.patheffects.withStroke(linewidth=3, foreground="white", alpha=0.8)]
+        ax.text(*middle, name, color=_ROOM, size=12, ha="center", va="center", zorder=4.5, path_effects=halo)
+    for d in store.rooms.doorways():
+        ax.plot(*view.on_page(d.position), "D", color=_ROOM, ms=5, mfc="white", zorder=4)
 
 
 def _draw_boxes(ax: Axes, view: PlanView, instances: list[Instance], tagged: set[int]) -> None:

@@ -80,6 +80,7 @@ def scene_prompt(
     listed = writer.rows(budget, ranked)
     if len(listed) < len(objects):
         writer.counts(budget, [name_of(i) for i in listed] if question else [])
+    writer.rooms(budget, listed)
     writer.changes(budget, listed)
     writer.gaps(budget, listed)
     writer.relations(budget, listed)
@@ -243,6 +244,19 @@ class _SceneWriter:
         common = sorted(count, key=lambda name: (-count[name], name))
         names = dict.fromkeys([*first, *common])
         budget.add_list("In all:", [f"{count[name]} {name}" for name in names], share=self.settings.share_of_counts)
+
+    def rooms(self, budget: Budget, listed: Sequence[Instance]) -> None:
+        """Add the rooms, with which of the listed instances are in each, and the doorways."""
+        shown = {i.id for i in listed}
+        inside = []
+        for r in self.memory.rooms():
+            name = shown_between(r.name or "unnamed", _SEPARATORS) + (" (partial)" if r.partial else "")
+            inside.append(f"room {r.id} {name}: {' '.join(str(n) for n in r.instances if n in shown) or '-'}")
+        if inside:
+            budget.add_list("Rooms, ids in them:", inside)
+        doors = [f"{d.a} {d.b}" for d in self.memory.doorways()]
+        if doors:
+            budget.add_list("Doorways between rooms:", doors)
 
     def changes(self, budget: Budget, listed: Sequence[Instance]) -> None:
         """Add the changes of the last session; what has no row, as what is gone, by its name alone."""

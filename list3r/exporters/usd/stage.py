@@ -23,6 +23,7 @@ from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_materia
 from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.core.records import Instance, Support
+from list3r.memory.library.rooms.naming import named_rooms, title
 from list3r.memory.store.store import Store
 
 
@@ -44,6 +45,8 @@ class UsdSettings:
             raise OptionError("a number of points cannot be negative; 0 leaves the points out")
 
 
+_OUTLINE_WIDTH = 0.02
+"""Of the outlines of rooms."""
 _TOGETHER = 200
 """Instances that are added at once."""
 
@@ -87,8 +90,9 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
 
     `/World/Instances/instance_12` is the box's own frame (translate, orient), with the points in it and the box as a
     guide; a moving instance has a sample of its translation for each frame that saw it. Floor, walls and the like are
-    under `/World/Structure`; time codes are frame numbers of the source. Another component is under
-    `/World/component_7`, invisible, so that it is not overlaid.
+    under `/World/Structure`; time codes are frame numbers of the source. `/World/Building/floor_0/room_3` has the
+    outline of a room, and relationships to its instances (`list3r:instances`) and to the rooms that doorways lead to
+    (`list3r:doorways`). Another component is under `/World/component_7`, invisible, so that it is not overlaid.
     """
     settings = settings or UsdSettings()
     components = read_components(store)
@@ -101,6 +105,8 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
             several = component.instances[start : start + _TOGETHER]
             paths |= _add_together(stage, scope.GetPath(), several, store, settings)
         add_cameras(stage, scope.GetPath(), component)
+        if component.id == min(c.id for c in components):
+            _add_rooms(stage, scope.GetPath(), store, paths)
     set_time_range(stage, components, store)
     _add_relations(stage, store, paths)
     return stage
@@ -128,6 +134,35 @@ def _prepare(stage: Usd.Stage, store: Store) -> Usd.Prim:
     stage.GetRootLayer().customLayerData = {"list3r": facts}
     world.SetCustomDataByKey("list3r", facts)
     return world
+
+
+def _add_rooms(stage: Usd.Stage, scope: Sdf.Path, store: Store, paths: dict[int, Sdf.Path]) -> None:
+    """Add building, floors and rooms; instances stay where they are and are what a room's relationship points to."""
+    rooms, where = named_rooms(store), {}
+    for room in rooms:
+        building = _group(stage, scope.AppendChild("Building"))
+        floor = _group(stage, building.AppendChild(f"floor_{room.floor}"))
+        where[room.id] = floor.AppendChild(f"room_{room.id}")
+        prim = UsdGeom.Xform.Define(stage, where[room.id]).GetPrim()
+        prim.SetDisplayName(title(room))
+        facts = {"room": room.id, "name": room.name or "", "reason": room.reason, "area": room.area}
+        prim.SetCustomDataByKey("list3r", facts | ({"partial": room.partial} if room.partial else {}))
+        inside = prim.CreateRelationship("list3r:instances", custom=True)
+        inside.SetTargets([paths[n] for n in room.instances if n in paths])
+        curve = UsdGeom.BasisCurves.Define(stage, where[room.id].AppendChild("outline"))
+        curve.CreateTypeAttr(UsdGeom.Tokens.linear)
+        curve.CreateWrapAttr(UsdGeom.Tokens.periodic)
+        corners = np.column_stack([room.outline, np.full(len(room.outline), room.floor_z)]).astype(np.float32)
+        curve.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners))
+        curve.CreateCurveVertexCountsAttr([len(corners)])
+        curve.CreateWidthsAttr([_OUTLINE_WIDTH])
+        curve.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        curve.CreateExtentAttr(UsdGeom.Curves.ComputeExtent(curve.GetPointsAttr().Get(), [_OUTLINE_WIDTH]))
+        curve.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    for n, path in where.items():
+        others = sorted({d.b if d.a == n else d.a for d in store.rooms.doorways() if n in (d.a, d.b)})
+        doors = stage.GetPrimAtPath(path).CreateRelationship("list3r:doorways", custom=True)
+        doors.SetTargets([where[k] for k in others])
 
 
 def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:

@@ -37,15 +37,16 @@ class Edit:
     author: str
     """Who."""
     kind: str
-    """merge, split, label, delete, scale, undo."""
+    """merge, split, label, delete, scale, room, undo."""
     parts: tuple[tuple[Key, ...], ...]
-    """The local instances concerned: the two instances of a merge, the two parts of a split, else one instance."""
+    """The local instances concerned: the two instances of a merge, the two parts of a split, else one instance. Of a
+    room the keyframes (chunk id, Frame.index) that were taken in it."""
     through: int
     """The last chunk then."""
     before: tuple[tuple[int, str | None, tuple[Key, ...]], ...]
     """Ids, labels and local instances of the instances it touched, as they were: what an undo brings back."""
     text: str | None = None
-    """The new label, or the anchor of scale as it was said."""
+    """The new label, the name of a room, or the anchor of scale as it was said."""
     target: int | None = None
     """The entry of the log that it takes back."""
     scale: tuple[int, float] | None = None

@@ -422,6 +422,42 @@ class Relation:
 
 
 @dataclass(frozen=True)
+class Room:
+    """A space between walls, seen from above."""
+
+    id: int
+    floor: int
+    """Its storey, from 0 for the lowest."""
+    floor_z: float
+    """Height of the floor, world."""
+    outline: NDArray[np.float64]
+    """World x and y of its corners, counterclockwise. Shape (N, 2)."""
+    area: float
+    """Square units of the world."""
+    partial: str
+    """Why it may be larger or end elsewhere; empty for a room that was seen whole."""
+    instances: tuple[int, ...] = ()
+    """Ids of what is in it, without its structure."""
+    name: str | None = None
+    """What it is called; None where nothing in it says so."""
+    reason: str = ""
+    """What it has its name from."""
+
+
+@dataclass(frozen=True)
+class Doorway:
+    """An opening between two rooms."""
+
+    a: int
+    b: int
+    """Ids of the rooms; a < b."""
+    position: NDArray[np.float64]
+    """Its middle, on the floor, world. Shape (3,)."""
+    width: float
+    """World units."""
+
+
+@dataclass(frozen=True)
 class ChangeEvent:
     """What a session showed of a thing that was known before, or of a new one where nothing stood before."""
 

@@ -21,6 +21,7 @@ from list3r.memory.library.instances import DerivedInstance, Members, derived_in
 from list3r.memory.library.overlap.pair_scores import Key, PairScores
 from list3r.memory.library.redundancy import Redundant, find_redundant
 from list3r.memory.library.relating import relate, with_structure
+from list3r.memory.library.rooms.derivation import Rooms, find_rooms
 from list3r.memory.library.rows import record_of
 from list3r.memory.library.scene import Scene
 from list3r.memory.library.scores import Pair
@@ -38,6 +39,7 @@ class Known:
     """What instances were called."""
     next_id: int
     """The smallest id that was never used."""
+    rooms: Rooms
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class Library:
     decisions: Sequence[MergeDecision]
     hidden: int
     """Groups that are not shown."""
+    rooms: Rooms | None
+    """None while a session goes on: rooms are found when it has ended."""
 
 
 def derive(scene: Scene, known: Known, *, ended: bool) -> Library:
@@ -68,6 +72,7 @@ def derive(scene: Scene, known: Known, *, ended: bool) -> Library:
     instances = with_structure(scene, _instances(scene, members, formed), members)
     states = {n: changes.states.get(g[0], "present") for n, g in members.items()}
     like = _like(formed.redundant, members)
+    there = {n: i.geometry for n, i in instances.items() if states[n] != "removed"}
     return Library(
         instances=_records(scene, instances, members, like, changes, states, _labels(scene, members, known)),
         features={n: i.feature for n, i in instances.items()},
@@ -78,6 +83,7 @@ def derive(scene: Scene, known: Known, *, ended: bool) -> Library:
         of_first={g[0]: n for n, g in members.items()},
         decisions=[*formed.places.decisions, *changes.decisions],
         hidden=len(weighed) - len(members),
+        rooms=find_rooms(scene, there, known.rooms) if ended else None,
     )
 
 

@@ -13,6 +13,7 @@ from list3r.memory.library.change.detection import as_events
 from list3r.memory.library.derivation import Known, Library
 from list3r.memory.library.identities import Identities
 from list3r.memory.library.overlap.pair_scores import Key
+from list3r.memory.library.rooms.derivation import Rooms
 from list3r.memory.library.scene import Scene
 from list3r.memory.store.store import Store
 
@@ -20,7 +21,8 @@ from list3r.memory.store.store import Store
 def read_known(store: Store) -> Known:
     """Return what was there before."""
     owners = {(o.chunk_id, o.local_id): o.instance_id for o in store.observations.all()}
-    return Known(owners, {i.id: i.label for i in store.instances.all()}, store.ids.next())
+    rooms = Rooms(store.rooms.all(), store.rooms.doorways(), store.facts.last_room)
+    return Known(owners, {i.id: i.label for i in store.instances.all()}, store.ids.next(), rooms)
 
 
 def write_library(scene: Scene, library: Library, known: Known, chunk_id: int) -> None:
@@ -37,6 +39,10 @@ def write_library(scene: Scene, library: Library, known: Known, chunk_id: int) -
     events = as_events([(library.of_first.get(first), event) for first, event in library.changes.events])
     if not _same(events, store.events.all()):
         store.events.replace(events)
+    if library.rooms is not None:
+        store.facts.last_room = library.rooms.last_id
+        if not _same([*library.rooms.rooms], [*known.rooms.rooms]):
+            store.rooms.replace(library.rooms.rooms, library.rooms.doorways)
     _log_decisions(store, chunk_id, library.decisions, known.owners, library.ids)
 
 

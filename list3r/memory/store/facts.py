@@ -68,6 +68,8 @@ class Facts:
     """From the frame of the pose graph to the world."""
     last_id = Fact[int]("last_id", int, 0)
     """The largest id that an instance ever had."""
+    last_room = Fact[int]("last_room", int, 0)
+    """The largest id that a room ever had."""
     text_models = Fact[Mapping[str, str]]("text_models", dict[str, str], MappingProxyType({}))
     """By embedding space, the weights of the text and image model that made its vectors."""
     replaces = Fact[tuple[int, ...] | None]("replaces", tuple[int, ...], None)

@@ -122,6 +122,17 @@ MIGRATIONS: tuple[str, ...] = (
         to_x REAL, to_y REAL, to_z REAL, to_box BLOB CHECK (length(to_box) = 96), frames TEXT NOT NULL,
         confidence REAL NOT NULL CHECK (confidence BETWEEN 0 AND 1), reason TEXT NOT NULL,
         PRIMARY KEY (session_id, instance)) STRICT, WITHOUT ROWID;
+    CREATE TABLE rooms (
+        id INTEGER PRIMARY KEY CHECK (id > 0), floor INTEGER NOT NULL CHECK (floor >= 0), floor_z REAL NOT NULL,
+        outline BLOB NOT NULL CHECK (length(outline) >= 48 AND length(outline) % 16 = 0),
+        area REAL NOT NULL CHECK (area > 0), partial TEXT NOT NULL) STRICT;
+    CREATE TABLE room_instances (
+        instance INTEGER PRIMARY KEY REFERENCES instances, room INTEGER NOT NULL REFERENCES rooms) STRICT;
+    CREATE INDEX room_instances_by_room ON room_instances (room);
+    CREATE TABLE doorways (
+        a INTEGER NOT NULL REFERENCES rooms, b INTEGER NOT NULL REFERENCES rooms CHECK (a < b),
+        position BLOB NOT NULL CHECK (length(position) = 24), width REAL NOT NULL CHECK (width > 0),
+        PRIMARY KEY (a, b, position)) STRICT, WITHOUT ROWID;
     CREATE TABLE detected_labels (
         instance INTEGER PRIMARY KEY REFERENCES instances, label TEXT NOT NULL,
         confidence REAL NOT NULL CHECK (confidence BETWEEN 0 AND 1), found REAL NOT NULL CHECK (found >= 0),

@@ -27,6 +27,7 @@ from list3r.memory.store.tables.local_instances import LocalInstances, Supports
 from list3r.memory.store.tables.observations import Observations
 from list3r.memory.store.tables.pair_scores import PairScoreTable
 from list3r.memory.store.tables.relations import RelationTable
+from list3r.memory.store.tables.rooms import RoomTable
 from list3r.memory.store.tables.sessions import Sessions
 from list3r.memory.store.tables.words import Words
 
@@ -136,6 +137,11 @@ class Store:
     def events(self) -> Events:
         """What changed between sessions."""
         return Events(self.connection)
+
+    @cached_property
+    def rooms(self) -> RoomTable:
+        """Rooms and the doorways between them."""
+        return RoomTable(self.connection)
 
     @cached_property
     def detected_labels(self) -> DetectedLabels:

@@ -43,6 +43,14 @@ _INVERSE = {
 """What a thing is to which another stands so: of "what is the cat lying on?"."""
 _SEVERAL = ("with", "supporting", "containing", "next to", "near")
 """Relations to all of several: "the desk with the laptop and the monitor"."""
+IN_ROOM = "in room"
+"""The predicate of a clause that names a room."""
+_ROOMS_AFTER = ("in", "at")
+_ANYWHERE = frozenset(
+    "room house apartment flat scene home world memory building view picture image video area zimmer haus wohnung "
+    "salle maison casa stanza habitación".split()
+)
+"""Places that are no room of their own."""
 _MOST_WORDS = 64
 _WHERE = ("where", "wo", "où", "dónde", "donde", "dove")
 
@@ -116,7 +124,7 @@ class Question:
 
     text: str
     kind: str
-    """which, where, count or exists."""
+    """which, where, count, exists, or room: in which room."""
     phrases: tuple[Phrase, ...]
     """What is asked for: what any of them means answers."""
     every: bool = False
@@ -141,7 +149,9 @@ def parse(text: str) -> Question:
         notes.append(f"the question has {len(words)} words; the first {_MOST_WORDS} were read")
         words = words[:_MOST_WORDS]
     words, place = _split_off(words, openings("seen_from"))
+    words, of_room = _without_which_room(words)
     kind, words = _kind(_adjectives_first(_with_its_end(words)))
+    kind = "room" if of_room else kind
     bounds, words = _bounds_of(words) if kind == "exists" else ((1, None), words)
     tokens = tokens_of(words) or ([Token("word", text, text)] if not text_words(text) else [])
     if kind == "exists" and len(tokens) > 1 and tokens[-1].kind == "relation":
@@ -150,9 +160,17 @@ def parse(text: str) -> Question:
     phrases, every = reader.question()
     seen_from = _Reader(tokens_of(place)).question()[0][0] if place else None
     if reader.places:
-        notes.append(f"rooms are not told apart: {reader.places[0]!r} was left out")
+        notes.append(f"{reader.places[0]!r} is no room of its own and was left out")
     all_of = kind == "exists" and bool({"all", "every", "each", "both"} & set(words))
     return Question(text, kind, phrases, every, all_of, *bounds, seen_from, tuple(notes))
+
+
+def _without_which_room(words: list[str]) -> tuple[list[str], bool]:
+    """Return what is left of "which room is the lamp in?", and whether a question asks so."""
+    rest = words[1:] if words[:1] == ["in"] else words
+    if rest[:1] not in (["which"], ["what"]) or rest[1:2] not in (["room"], ["rooms"]) or len(rest) < 3:
+        return words, False
+    return rest[2:-1] if rest[-1] == "in" else rest[2:], True
 
 
 def _bounds_of(words: list[str]) -> tuple[tuple[int, int | None], list[str]]:
@@ -307,6 +325,9 @@ class _Reader:
                 other = self._phrase()
             elif first.generic:
                 return []
+        room = _room_name(first) if token.value in _ROOMS_AFTER else None
+        if room is not None:
+            return [Clause(token.text, (IN_ROOM,), Phrase(room), negated=negated)]
         if first.generic and first.order is None and first.text in (*table()["places"].split(), "anything"):
             if first.text != "anything":
                 self.places.append(first.text)
@@ -397,7 +418,7 @@ def _phrase_of(tokens: list[Token]) -> Phrase:
     text = " ".join(t.text for t in tokens)
     places = table()["places"].split()
     if words and set(words) <= set(places) and {t.kind for t in tokens} == {"word"}:
-        return Phrase(words[0])
+        return Phrase(" ".join(words))
     return Phrase(
         text or "anything",
         tuple(w for w in dict.fromkeys(words) if w not in places),
@@ -410,6 +431,15 @@ def _phrase_of(tokens: list[Token]) -> Phrase:
         (),
         last["change"].value if "change" in last else None,
     )
+
+
+def _room_name(phrase: Phrase) -> str | None:
+    """Return the name or the number of a room that a phrase means: "living room", "room 3"; None for anything else."""
+    words = phrase.text.split()
+    if words[0] == "room" and phrase.instance_id is not None:
+        return str(phrase.instance_id)
+    named = words[-1] in table()["places"].split() and not (phrase.noun or phrase.use or phrase.order)
+    return phrase.text if named and not set(words) <= _ANYWHERE else None
 
 
 def _name(token: Token) -> tuple[str, ...]:

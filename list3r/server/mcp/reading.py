@@ -71,6 +71,24 @@ class ReadingTools:
             "changes": len(m.changes()),
         }
 
+    def rooms(self) -> dict[str, Any]:
+        """Rooms with names, areas, ids of the things in them and doorways. `find` takes "lamp in the bedroom"."""
+        doors = self._memory.doorways()
+        return {
+            "rooms": [
+                {
+                    "id": r.id,
+                    "name": None if r.name is None else shown(r.name),
+                    "floor": r.floor,
+                    "area": number(r.area),
+                    "partial": r.partial or None,
+                    "ids": list(r.instances),
+                    "doorways_to": sorted({d.b if d.a == r.id else d.a for d in doors if r.id in (d.a, d.b)}),
+                }
+                for r in self._memory.rooms()
+            ]
+        }
+
     def find(self, text: Words, limit: Limit = 10) -> dict[str, Any]:
         """Answer a question in plain words: "white mug on the table", "where is the remote?", "something to sit on",
         "chair closest to the door", "second book from the left", "lamp that is not on the desk", "what moved?".

@@ -46,6 +46,13 @@ class MemoryEdits:
         with self._lock:
             return edits.label(self._writable(), id_of(instance_id), text, author)
 
+    def name_room(self, room: int, text: str | None, *, author: str | None = None) -> EditReport:
+        """Name a room by its id; None takes the name away, and what stands in it names it again."""
+        from list3r.memory.library.maintenance import edits
+
+        with self._lock:
+            return edits.name_room(self._writable(), room, text, author)
+
     def delete(self, instance_id: int | Instance, *, author: str | None = None) -> EditReport:
         """Remove an instance, also from later sessions."""
         from list3r.memory.library.maintenance import edits

@@ -19,6 +19,7 @@ from list3r.memory.core.records import JsonFields, MergeDecision, Observation
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
 from list3r.memory.library.maintenance.split_proposal import propose_split
+from list3r.memory.library.rooms.naming import keyframes_in
 from list3r.memory.library.world.scale import measure, parse_anchor, rescale
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.edits import LogEntry
@@ -34,7 +35,7 @@ class EditReport(JsonFields):
     entry: int
     """Its number in the merge log, for `undo`."""
     kind: str
-    """merge, split, label, delete, scale, undo."""
+    """merge, split, label, delete, scale, room, undo."""
     ids: tuple[int, ...]
     """The instances that are there now of what it touched, the one that was spoken of first."""
     new: tuple[int, ...]
@@ -96,6 +97,25 @@ def label(store: Store, instance_id: int, text: str | None, author: str | None =
         edit = _write_down(store, edit, (f"#{known}", cleaned or ""), reason)
         store.instances.set_labels({known: cleaned})
         return EditReport(edit.entry, "label", (known,), (), (), (), reason)
+
+
+def name_room(store: Store, room: int, text: str | None, author: str | None = None) -> EditReport:
+    """Give a room a name; nothing, or an empty text, takes the name of a person away.
+
+    Raises `OptionError` for a room that there is not, or in which no keyframe was taken.
+    """
+    cleaned = _line(text or "", "name") or None
+    with store.transaction():
+        found = next((r for r in store.rooms.all() if r.id == room), None)
+        if found is None:
+            raise OptionError(f"{store.path} has no room {room}; `list3r rooms {store.path}` lists the rooms")
+        keys = keyframes_in(store, found)
+        if not keys:
+            raise OptionError(f"room {room} was only seen from other rooms; film it from inside to name it")
+        edit = replace(_edit("room", (keys,), (), author), text=cleaned)
+        reason = f"{edit.author} named room {room} {cleaned!r}" if cleaned else f"{edit.author} unnamed room {room}"
+        edit = _write_down(store, edit, (f"room {room}", cleaned or ""), reason)
+        return EditReport(edit.entry, "room", (), (), (), (), reason)
 
 
 def delete(store: Store, instance_id: int, author: str | None = None) -> EditReport:

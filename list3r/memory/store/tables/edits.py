@@ -15,7 +15,7 @@ from list3r.memory.store.rows.columns import Columns, joined, nested
 from list3r.memory.store.rows.json_values import plain
 from list3r.memory.store.rows.table import Table
 
-EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "undo")
+EDIT_KINDS = ("merge", "split", "label", "delete", "scale", "room", "undo")
 
 
 @dataclass(frozen=True)

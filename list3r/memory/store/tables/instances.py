@@ -21,6 +21,7 @@ from list3r.memory.store.tables.events import Events
 from list3r.memory.store.tables.ids import Ids
 from list3r.memory.store.tables.labels import DetectedLabels
 from list3r.memory.store.tables.relations import RelationTable
+from list3r.memory.store.tables.rooms import RoomTable
 from list3r.memory.store.tables.words import Words
 
 Array = NDArray[np.float64]
@@ -156,7 +157,8 @@ class Instances:
         for table in (Embeddings, DetectedLabels):
             table(self._connection).drop(instance_id)
         RelationTable(self._connection, self._ids).drop(instance_id)
-        Events(self._connection).drop(instance_id, alias_of)
+        for held in (Events, RoomTable):
+            held(self._connection).drop(instance_id, alias_of)
         if alias_of is not None:
             self._ids.add_aliases({instance_id: alias_of})
 
