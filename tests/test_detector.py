@@ -19,9 +19,18 @@ from list3r.memory.core.description.coco import COCO_80, SIZES_M, plausible
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Votes
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.labels import LabelSettings, apply_labels, decide, put_votes, votes_of_names
+from list3r.memory.library.labels import (
+    OWN_NAMES,
+    LabelSettings,
+    apply_labels,
+    decide,
+    put_votes,
+    votes_of_names,
+    votes_of_probabilities,
+)
 from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
+from list3r.queries.find import find
 from list3r.semantics.detection import detect
 from list3r.semantics.detector import Detections
 from list3r.semantics.nanodet import DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
@@ -375,6 +384,24 @@ def test_where_a_label_comes_from_is_told(memory: Path, capsys: pytest.CaptureFi
     rows = {i["id"]: i for i in json.loads((tmp_path / "s.json").read_text())["instances"]}
     assert (rows[red]["label_source"], rows[blue]["label_confidence"]) == ("test-net", 1.0)
     assert "label_source" not in rows[named_in(rows)]
+
+
+def test_what_is_only_known_to_be_a_seat_is_told_so_and_found_after_the_chairs(
+    memory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Store.open(memory, writable=True) as store:
+        red, green = named(store, ROOM["red"].rgb), named(store, ROOM["green"].rgb)
+        say(store, red, votes_of_probabilities([("chair", 0.5), ("stool", 0.3), ("sofa", 0.19)]), source=OWN_NAMES)
+        say(store, green, CHAIR)
+        assert store.detected_labels.all()[red].level == "branch" and store.instances.get(red).label == "seat"
+        assert find(store, "seat")[0].instance.id == red
+        assert find(store, "how many chairs are there?").counted == 1
+    assert run(["query", "find", str(memory), "chair", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["matches"]
+    assert [r["id"] for r in rows] == [green, red] and rows[1]["score"] < 0.5 < rows[0]["score"]
+    assert "may be a chair" in rows[1]["reason"]
+    assert run(["show", str(memory), str(red), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["matches"][0]["label_level"] == "branch"
 
 
 def named_in(rows: dict[int, dict[str, object]]) -> int:
