@@ -259,11 +259,12 @@ def sure_enough(rows: Sequence[Named]) -> LabelSettings:
     """Return the least probabilities from which on names are right in 0.9 and branches in 0.95 of the cases."""
     chosen = LabelSettings(min_own=0.99, min_branch=0.99)
     for name, level, wanted in (("min_own", "leaf", 0.9), ("min_branch", "branch", 0.95)):
-        for least in np.arange(0.96, 0.5, -0.01).round(2).tolist():
+        for least in np.arange(0.5, 0.96, 0.01).round(2).tolist():
             tried = replace(chosen, **{name: least})
-            if told(rows, tried)[f"{level}_right"] < wanted:
+            said = told(rows, tried)
+            if said[level] and said[f"{level}_right"] >= wanted:
+                chosen = tried
                 break
-            chosen = tried
     return chosen
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import shutil
@@ -33,8 +34,9 @@ from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.semantics.detection import detect
 from list3r.semantics.detector import Detections
-from list3r.semantics.nanodet import DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
+from list3r.semantics.nanodet import PUBLISHED, DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
 from list3r.semantics.voting import ThingInFrame, summed, vote
+from list3r.weights import PublishedFile, fetch_files
 from tests.session_scenes import ROOM, add_session, cameras, place_together
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -424,3 +426,56 @@ def test_a_memory_without_pictures_says_what_is_needed(memory: Path) -> None:
         with pytest.raises(OptionError, match="--source"):
             detect(store, Everything())
         assert store.votes.of(1) == {}
+
+
+# ---------------------------------------------------------------------------------------------- weights
+
+
+def test_weights_are_fetched_once_told_before_and_refused_where_they_are_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    origin, told = tmp_path / "origin.bin", list[str]()
+    origin.write_bytes(b"weights")
+    file = PublishedFile(origin.as_uri(), hashlib.sha256(b"weights").hexdigest(), 7)
+    folder = fetch_files("net", {"net.bin": file}, told.append)
+    assert (folder / "net.bin").read_bytes() == b"weights" and "0.0 MB" in told[0]
+    origin.unlink()
+    assert fetch_files("net", {"net.bin": file}, told.append) == folder and len(told) == 1
+    with pytest.raises(OptionError, match="cannot be fetched"):
+        fetch_files("net", {"other.bin": file}, told.append)
+    origin.write_bytes(b"changed")
+    with pytest.raises(OptionError, match="not the file that was published"):
+        fetch_files("net", {"other.bin": file}, told.append)
+    assert sorted(p.name for p in folder.iterdir()) == ["net.bin"]
+
+
+@needs_weights
+def test_the_weights_that_are_fetched_are_those_that_are_measured() -> None:
+    for name, file in PUBLISHED.items():
+        data = (WEIGHTS / name).read_bytes()
+        assert (hashlib.sha256(data).hexdigest(), len(data)) == (file.sha256, file.size_bytes)
+
+
+def test_our_nouns_are_the_prompts_of_an_open_vocabulary(tmp_path: Path) -> None:
+    t = pytest.importorskip("transformers")
+    torch = pytest.importorskip("torch")
+    from list3r.semantics.open_vocabulary import OpenVocabulary
+    from tests.neural_models import save_text_image
+
+    folder = save_text_image("clip", tmp_path)
+    (folder / "model.safetensors").unlink()
+    small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    text = small | {"vocab_size": 12, "max_position_embeddings": 16, "eos_token_id": 2, "pad_token_id": 0}
+    vision = small | {"image_size": 32, "patch_size": 8}
+    torch.manual_seed(0)
+    config = t.Owlv2Config(text_config=text, vision_config=vision, projection_dim=16)
+    t.Owlv2ForObjectDetection(config).save_pretrained(folder)
+    network = OpenVocabulary(folder, "cpu")
+    assert {"chair", "mug"} <= set(network.class_names) and len(network.class_names) > 300
+    picture = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    seen = network(picture)
+    assert len(seen.scores) == len(seen.classes) > 0
+    assert (seen.boxes_xyxy >= 0).all() and (seen.boxes_xyxy <= [80, 60, 80, 60]).all()
+    again = network(picture)
+    assert np.array_equal(seen.boxes_xyxy, again.boxes_xyxy)

@@ -39,6 +39,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "build.update": ("update",),
     "edit.scale": ("scale",),
     "models.detect": ("detect",),
+    "models.names": ("names",),
     "models.commands": ("models", "precompute"),
     "serve.mcp": ("mcp", "ask-config"),
     "serve.view": ("view",),
@@ -58,7 +59,7 @@ FUNCTIONS = {
 GROUPS: dict[str, tuple[str, ...]] = {
     "Build": ("inspect", "build", "update", "batch", "import", "convert", "precompute", "demo"),
     "Ask": ("info", "list", "show", "query", "picture", "view", "mcp", "ask-config", "serve"),
-    "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "detect", "embed"),
+    "Edit": ("label", "merge", "split", "delete", "undo", "merges", "scale", "names", "detect", "embed"),
     "Export": ("export", "catalog"),
     "Evaluate": ("eval",),
     "Maintain": ("verify", "repair", "doctor", "models"),
