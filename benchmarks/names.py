@@ -9,8 +9,9 @@ PYTHONPATH=. python benchmarks/names.py --left-out 5000-5011 --left-out-fitted 5
 Rooms are those of `training/worlds`; `--left-out` ones have kinds, textures and a sensor that training never shows,
 `--odd` ones objects without a name. A place is a file of a Gazebo world, or the folder of one. All listed instances
 without structure are scored: a name is right if the best matching true object by voxels, with an IoU of 0.25, has it;
-any name of an instance without a match, or of an object without a known name, is wrong. `--fit` prints the
-`NameConfidence` fitted to the given rooms, all kinds with equal weight.
+any name of an instance without a match, or of an object without a known name, is wrong. A branch ("seat") is right if
+the true name is in it. `--fit` prints the `NameConfidence` fitted to the given rooms, all kinds with equal weight, and
+from which probability on names and branches are right often enough there.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import argparse
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +33,22 @@ from scipy.optimize import minimize
 
 from list3r.instances.learned.agglomeration import agglomerate
 from list3r.instances.learned.cut import CutSettings, join_parts
-from list3r.instances.learned.discovery import LearnedSettings
+from list3r.instances.learned.discovery import LearnedSettings, named
 from list3r.instances.learned.graph import chunk_surface
-from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs
+from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs, with_confidence
 from list3r.instances.learned.pieces import cut_pieces
-from list3r.instances.learned.verdicts import first_verdicts, names_of, segment_features
+from list3r.instances.learned.verdicts import SegmentVerdicts, first_verdicts, names_of, segment_features
 from list3r.instances.learned.weights import load_weights
 from list3r.instances.settings import SegmentSettings
+from list3r.memory.core.description.nouns import is_a
+from list3r.memory.core.records import Votes
+from list3r.memory.library.labels import (
+    OWN_NAMES,
+    LabelSettings,
+    decide_by_rank,
+    decide_kind,
+    votes_of_probabilities,
+)
 from training.graphs import surroundings_of
 from training.samples import Sample, sample_of
 from training.worlds.catalogue import LABELS
@@ -111,6 +121,10 @@ class Named:
     """Whether the likeliest name is right. Shape (T,)."""
     nameable: NDArray[np.bool_]
     """Whether it fits an object that one of the names goes with. Shape (T,)."""
+    votes: list[Votes]
+    """What the discoverer says of each object in a build."""
+    calls: list[frozenset[str]]
+    """The names that each may truly have."""
 
 
 def main() -> None:
@@ -132,6 +146,7 @@ def main() -> None:
         print(group, json.dumps(entry))
     if words["fit"]:
         print(fitted(list(found.values())))
+        print(sure_enough([r for rows in found.values() for r in rows]))
     write_json(words["json"], {"mean": table})
 
 
@@ -175,7 +190,10 @@ def _kept(path: Path, make: Callable[[], Sample]) -> Named:
     right = np.array([LABELS[k] in c for k, c in zip(names.argmax(axis=1), calls, strict=True)])
     nameable = np.array([bool(c) for c in calls])
     kept = NameSigns(signs.odds[rows], signs.whole[rows], signs.others)
-    return Named(kept, names.max(axis=1)[rows], right[rows], nameable[rows])
+    believed = with_confidence(names, NameConfidence().probability(signs))[rows]
+    likely = named(SegmentVerdicts(structure[rows], whole[rows], believed), LABELS)
+    votes = [votes_of_probabilities(said) for said in likely]
+    return Named(kept, names.max(axis=1)[rows], right[rows], nameable[rows], votes, [calls[k] for k in rows])
 
 
 def _calls(label: str) -> frozenset[str]:
@@ -216,11 +234,38 @@ def summary(rows: Sequence[Named]) -> dict[str, Any]:
         p = np.concatenate(said)
         entry: dict[str, Any] = {**calibration(p, right)}
         for t in LEAST:
-            named = p >= t
-            share = round(float(named[nameable].mean()), 3)
-            entry[f"from_{t:g}"] = {"named": int(named.sum()), "wrong": int((named & ~right).sum()), "coverage": share}
+            shown = p >= t
+            share = round(float(shown[nameable].mean()), 3)
+            entry[f"from_{t:g}"] = {"named": int(shown.sum()), "wrong": int((shown & ~right).sum()), "coverage": share}
         out[word] = entry
-    return out
+    return {**out, "told": told(rows, LabelSettings())}
+
+
+def told(rows: Sequence[Named], settings: LabelSettings) -> dict[str, Any]:
+    """Return how many objects get a name, a branch or a description, and the shares of the first two that are right."""
+    count, right = {"leaf": 0, "branch": 0, "description": 0}, {"leaf": 0, "branch": 0}
+    for votes, calls in ((v, c) for r in rows for v, c in zip(r.votes, r.calls, strict=True)):
+        leaf, kind = (f({OWN_NAMES: votes}, None, settings) for f in (decide_by_rank, decide_kind))
+        level = "leaf" if leaf else "branch" if kind else "description"
+        count[level] += 1
+        if leaf:
+            right["leaf"] += leaf[0] in calls
+        elif kind:
+            right["branch"] += any(is_a(c, kind[0]) for c in calls)
+    return {**count, **{f"{k}_right": round(n / max(count[k], 1), 3) for k, n in right.items()}}
+
+
+def sure_enough(rows: Sequence[Named]) -> LabelSettings:
+    """Return the least probabilities from which on names are right in 0.9 and branches in 0.95 of the cases."""
+    chosen = LabelSettings(min_own=0.99, min_branch=0.99)
+    for name, level, wanted in (("min_own", "leaf", 0.9), ("min_branch", "branch", 0.95)):
+        for least in np.arange(0.5, 0.96, 0.01).round(2).tolist():
+            tried = replace(chosen, **{name: least})
+            said = told(rows, tried)
+            if said[level] and said[f"{level}_right"] >= wanted:
+                chosen = tried
+                break
+    return chosen
 
 
 def fitted(groups: Sequence[Sequence[Named]]) -> NameConfidence:

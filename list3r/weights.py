@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,3 +60,43 @@ def _checksum(arrays: Mapping[str, NDArray[np.generic]]) -> str:
     for name in sorted(arrays):
         digest.update(name.encode() + b"\0" + str(arrays[name].shape).encode() + arrays[name].tobytes())
     return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class PublishedFile:
+    """A file that somebody published, known by its digest."""
+
+    url: str
+    sha256: str
+    size_bytes: int
+
+
+def fetch_files(what: str, files: Mapping[str, PublishedFile], note: Callable[[str], None]) -> Path:
+    """Return the folder that holds files by name, loaded where they are not in the cache; `note` hears of that before.
+
+    Raises `OptionError` where the network cannot be reached, or where what comes is not what was published.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    folder = Path(base).expanduser() / "list3r" / "weights"
+    missing = {n: f for n, f in files.items() if not _is(folder / n, f)}
+    if missing:
+        host = urlsplit(next(iter(missing.values())).url).hostname
+        size = sum(f.size_bytes for f in missing.values()) / 1e6
+        note(f"fetching {what} from {host}, {size:.1f} MB, once; it is kept in {folder}")
+    for name, file in missing.items():
+        try:
+            with urlopen(file.url, timeout=30) as answer:
+                data = answer.read(file.size_bytes + 1)
+        except OSError as error:
+            raise OptionError(f"{what} cannot be fetched ({error}); give its file by --detector FILE") from None
+        if hashlib.sha256(data).hexdigest() != file.sha256:
+            raise OptionError(f"{name} from {file.url} is not the file that was published; give one by --detector FILE")
+        folder.mkdir(parents=True, exist_ok=True)
+        part = folder / f"{name}.{os.getpid()}.part"
+        part.write_bytes(data)
+        part.replace(folder / name)
+    return folder
+
+
+def _is(path: Path, file: PublishedFile) -> bool:
+    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == file.sha256

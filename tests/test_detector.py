@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import shutil
@@ -19,13 +20,23 @@ from list3r.memory.core.description.coco import COCO_80, SIZES_M, plausible
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Votes
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.labels import LabelSettings, apply_labels, decide, put_votes, votes_of_names
+from list3r.memory.library.labels import (
+    OWN_NAMES,
+    LabelSettings,
+    apply_labels,
+    decide,
+    put_votes,
+    votes_of_names,
+    votes_of_probabilities,
+)
 from list3r.memory.library.maintenance import edits
 from list3r.memory.store.store import Store
+from list3r.queries.find import find
 from list3r.semantics.detection import detect
 from list3r.semantics.detector import Detections
-from list3r.semantics.nanodet import DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
+from list3r.semantics.nanodet import PUBLISHED, DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
 from list3r.semantics.voting import ThingInFrame, summed, vote
+from list3r.weights import PublishedFile, fetch_files
 from tests.session_scenes import ROOM, add_session, cameras, place_together
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -377,6 +388,24 @@ def test_where_a_label_comes_from_is_told(memory: Path, capsys: pytest.CaptureFi
     assert "label_source" not in rows[named_in(rows)]
 
 
+def test_what_is_only_known_to_be_a_seat_is_told_so_and_found_after_the_chairs(
+    memory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Store.open(memory, writable=True) as store:
+        red, green = named(store, ROOM["red"].rgb), named(store, ROOM["green"].rgb)
+        say(store, red, votes_of_probabilities([("chair", 0.5), ("stool", 0.3), ("sofa", 0.19)]), source=OWN_NAMES)
+        say(store, green, CHAIR)
+        assert store.detected_labels.all()[red].level == "branch" and store.instances.get(red).label == "seat"
+        assert find(store, "seat")[0].instance.id == red
+        assert find(store, "how many chairs are there?").counted == 1
+    assert run(["query", "find", str(memory), "chair", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["matches"]
+    assert [r["id"] for r in rows] == [green, red] and rows[1]["score"] < 0.5 < rows[0]["score"]
+    assert "may be a chair" in rows[1]["reason"]
+    assert run(["show", str(memory), str(red), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["matches"][0]["label_level"] == "branch"
+
+
 def named_in(rows: dict[int, dict[str, object]]) -> int:
     """An instance without a label."""
     return next(n for n, row in rows.items() if row["label"] is None)
@@ -397,3 +426,56 @@ def test_a_memory_without_pictures_says_what_is_needed(memory: Path) -> None:
         with pytest.raises(OptionError, match="--source"):
             detect(store, Everything())
         assert store.votes.of(1) == {}
+
+
+# ---------------------------------------------------------------------------------------------- weights
+
+
+def test_weights_are_fetched_once_told_before_and_refused_where_they_are_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    origin, told = tmp_path / "origin.bin", list[str]()
+    origin.write_bytes(b"weights")
+    file = PublishedFile(origin.as_uri(), hashlib.sha256(b"weights").hexdigest(), 7)
+    folder = fetch_files("net", {"net.bin": file}, told.append)
+    assert (folder / "net.bin").read_bytes() == b"weights" and "0.0 MB" in told[0]
+    origin.unlink()
+    assert fetch_files("net", {"net.bin": file}, told.append) == folder and len(told) == 1
+    with pytest.raises(OptionError, match="cannot be fetched"):
+        fetch_files("net", {"other.bin": file}, told.append)
+    origin.write_bytes(b"changed")
+    with pytest.raises(OptionError, match="not the file that was published"):
+        fetch_files("net", {"other.bin": file}, told.append)
+    assert sorted(p.name for p in folder.iterdir()) == ["net.bin"]
+
+
+@needs_weights
+def test_the_weights_that_are_fetched_are_those_that_are_measured() -> None:
+    for name, file in PUBLISHED.items():
+        data = (WEIGHTS / name).read_bytes()
+        assert (hashlib.sha256(data).hexdigest(), len(data)) == (file.sha256, file.size_bytes)
+
+
+def test_our_nouns_are_the_prompts_of_an_open_vocabulary(tmp_path: Path) -> None:
+    t = pytest.importorskip("transformers")
+    torch = pytest.importorskip("torch")
+    from list3r.semantics.open_vocabulary import OpenVocabulary
+    from tests.neural_models import save_text_image
+
+    folder = save_text_image("clip", tmp_path)
+    (folder / "model.safetensors").unlink()
+    small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    text = small | {"vocab_size": 12, "max_position_embeddings": 16, "eos_token_id": 2, "pad_token_id": 0}
+    vision = small | {"image_size": 32, "patch_size": 8}
+    torch.manual_seed(0)
+    config = t.Owlv2Config(text_config=text, vision_config=vision, projection_dim=16)
+    t.Owlv2ForObjectDetection(config).save_pretrained(folder)
+    network = OpenVocabulary(folder, "cpu")
+    assert {"chair", "mug"} <= set(network.class_names) and len(network.class_names) > 300
+    picture = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    seen = network(picture)
+    assert len(seen.scores) == len(seen.classes) > 0
+    assert (seen.boxes_xyxy >= 0).all() and (seen.boxes_xyxy <= [80, 60, 80, 60]).all()
+    again = network(picture)
+    assert np.array_equal(seen.boxes_xyxy, again.boxes_xyxy)

@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from benchmarks.calibration import calibration
 from list3r.instances.geometric.support import without_fliers
 from list3r.instances.learned.name_confidence import NameConfidence, NameSigns, name_signs, with_confidence
+from list3r.memory.core.description.nouns import is_a
 from list3r.memory.library.labels import (
     OWN_NAMES,
     LabelSettings,
     decide,
     decide_by_rank,
+    decide_kind,
     votes_of_names,
     votes_of_probabilities,
 )
@@ -55,6 +57,27 @@ def test_what_only_the_discoverer_says_must_be_surer_than_what_a_detector_says()
     assert decide_by_rank({"detector": votes}) is not None and decide_by_rank({OWN_NAMES: votes}) is None
     lenient = replace(LabelSettings(), min_own=0.5)
     assert decide_by_rank({OWN_NAMES: votes}, settings=lenient) == decide({OWN_NAMES: votes})
+
+
+def test_names_that_are_unsure_alone_make_the_kind_that_they_share_sure() -> None:
+    seats = {OWN_NAMES: votes_of_probabilities([("chair", 0.5), ("stool", 0.3), ("armchair", 0.19)])}
+    assert decide_by_rank(seats) is None
+    kind = decide_kind(seats)
+    assert kind is not None and kind[0] == "seat" and kind[1] == pytest.approx(0.97 * 0.99, abs=0.02)
+    assert decide_kind({OWN_NAMES: votes_of_probabilities([("chair", 0.5), ("lamp", 0.49)])}) is None
+    chairs = {OWN_NAMES: votes_of_probabilities([("chair", 0.55), ("armchair", 0.44)])}
+    assert (decide_kind(chairs) or [""])[0] == "chair", "the narrowest kind that is sure"
+
+
+@given(st.lists(st.sampled_from(["chair", "stool", "sofa", "desk", "mug", "bowl"]), min_size=1, unique=True), st.data())
+def test_a_kind_is_at_least_as_probable_as_each_name_in_it(names: list[str], data: st.DataObject) -> None:
+    shares = data.draw(st.lists(st.floats(0.01, 1.0), min_size=len(names), max_size=len(names)))
+    named = [(n, 0.97 * s / sum(shares)) for n, s in zip(names, shares, strict=True)]
+    votes, lenient = {OWN_NAMES: votes_of_probabilities(named)}, LabelSettings(min_branch=0.0, min_confidence=0.0)
+    leaf, kind = decide(votes, settings=lenient), decide_kind(votes, settings=replace(lenient, min_branch=0.9))
+    assert leaf is not None and (kind is None or kind[1] >= 0.9)
+    if kind is not None and is_a(leaf[0], kind[0]):
+        assert kind[1] >= leaf[1] - 1e-9
 
 
 @given(st.integers(0, 10_000))

@@ -40,6 +40,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "edit.files": ("verify", "repair", "doctor"),
     "models.embed": ("embed",),
     "models.detect": ("detect",),
+    "models.names": ("names",),
     "models.commands": ("models", "precompute"),
     "measure.commands": ("eval",),
     "serve.view": ("view",),
@@ -54,7 +55,7 @@ FIRST: dict[str, tuple[str, ...]] = {
     "Build": ("build", "update"),
     "Look": ("info", "list", "show", "rooms", "view"),
     "Ask": ("find", "nearest", "relations", "similar", "changes"),
-    "Change and use": ("edit", "export"),
+    "Change and use": ("names", "edit", "export"),
 }
 """Sections of the first screen of the help, in order: what most people need, at most 15 commands."""
 REST: dict[str, tuple[str, ...]] = {

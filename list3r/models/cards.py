@@ -300,6 +300,7 @@ CARDS: tuple[ModelCard, ...] = (
         Weights("openai/clip-vit-base-patch32", MIT, revision="3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268"),
         "free words in find and nearest",
     ),
+    _hub("owlv2", "detector", Weights("google/owlv2-base-patch16-ensemble", APACHE), "labels of all our nouns"),
     ModelCard("nanodet", "detector", APACHE, (), ("ncnn",), "pip install ncnn", about="labels of 80 kinds of objects"),
     ModelCard("aliked", "local features", BSD3, (), ("torch",), "pip install torch", about="learned local features"),
 )

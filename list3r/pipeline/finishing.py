@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from list3r.frames.options import SourceOptions
-from list3r.memory.core.errors import List3rError, OptionError
+from list3r.memory.core.errors import List3rError, OptionError, check_choice
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.labels import apply_labels
 from list3r.memory.library.maintenance.edits import EditReport, scale
@@ -22,6 +24,7 @@ from list3r.semantics.detection import DetectReport, detect, open_sources
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import BuildReport, UpdateReport
+    from list3r.semantics.detector import Detector
     from list3r.semantics.nanodet import NanoDet
 
 R = TypeVar("R", bound="BuildReport | UpdateReport")
@@ -36,7 +39,7 @@ class FinishingError(List3rError):
         """The `BuildReport` or `UpdateReport`: the memory is there all the same."""
 
 
-def check_run(run: RunOptions) -> None:
+def check_run(run: RunOptions, note: Callable[[str], None] = lambda _: None) -> None:
     """Raise `OptionError` for what cannot be done, before hours are spent."""
     if run.workers is not None and run.workers < 0:
         raise OptionError(f"--workers {run.workers}: give the number of worker processes, 0 for none")
@@ -50,8 +53,11 @@ def check_run(run: RunOptions) -> None:
         raise OptionError("--resume continues what is there and --force discards it; give one of them")
     if run.scale_anchor is not None:
         parse_anchor(run.scale_anchor)
-    if run.detector is not None:
-        load_detector(run.detector, run.detector_classes)
+    naming = _naming(run)
+    if run.live and run.names != "none":
+        raise OptionError(f"--names {run.names} needs the whole video; run `list3r names MEMORY` when it is built")
+    if naming is not None:
+        load_naming(naming, run.detector, run.detector_classes, note)
     elif run.detector_classes is not None:
         raise OptionError(f"--detector-classes {run.detector_classes} needs a detector: --detector FILE")
 
@@ -67,11 +73,14 @@ def finish(report: R, memory: Path, source: str | Path, options: SourceOptions, 
         failure = error
         notes.append(f"the scale is not anchored; `list3r edit scale {memory} --anchor ANCHOR` does it")
     try:
-        if run.detector is not None:
-            network = load_detector(run.detector, run.detector_classes)
+        naming = _naming(run)
+        if naming is not None:
+            network = load_naming(naming, run.detector, run.detector_classes)
             seen = name_things(memory, network, str(source), options, watch.looking("names"))
             notes.append(f"{seen.detector} named {len(seen.labels)} things")
             guess_anew(memory)
+        else:
+            notes += _unnamed(memory)
     except List3rError as error:
         failure = failure or error
     report = replace(report, notes=tuple(notes))
@@ -105,7 +114,7 @@ def guess_anew(memory: Path) -> None:
 
 
 def name_things(
-    memory: Path, network: NanoDet, source: str | None, options: SourceOptions | None, progress: Progress | None = None
+    memory: Path, network: Detector, source: str | None, options: SourceOptions | None, progress: Progress | None = None
 ) -> DetectReport:
     """Let a detector look at a memory: at frames of the source's session where one is named, else at all pictures.
 
@@ -115,6 +124,48 @@ def name_things(
         opened = None if source is None else open_sources(store, source, options)
         chunks = None if opened is None else [c.chunk_id for c in store.chunks.all() if c.session_id in opened]
         return detect(store, network, opened, chunks=chunks, progress=progress)
+
+
+def load_naming(
+    by: str, weights: Path | None, classes: Path | None, note: Callable[[str], None] = lambda _: None
+) -> Detector:
+    """Return the detector that is asked for, its weights fetched where none are given; `note` hears of that before.
+
+    The environment's `LIST3R_NANODET` names a file of NanoDet to use instead. Raises `OptionError`.
+    """
+    check_choice("--names", by, ("detector", "open"))
+    if by == "open":
+        from list3r.models.cache import locate, resolve
+        from list3r.models.cards import find_card
+        from list3r.semantics.open_vocabulary import OpenVocabulary
+
+        card = find_card("owlv2", "detector")
+        asked = None if weights is None else str(weights)
+        return OpenVocabulary(locate(resolve(asked, card.weights[0] if card else None, "--names open")))
+    from list3r.semantics.nanodet import PUBLISHED
+    from list3r.weights import fetch_files
+
+    file = weights or (Path(own) if (own := os.environ.get("LIST3R_NANODET")) else None)
+    if file is None:
+        file = fetch_files("NanoDet (Apache-2.0)", PUBLISHED, note) / next(iter(PUBLISHED))
+    return load_detector(file, classes)
+
+
+def _naming(run: RunOptions) -> str | None:
+    """Return who names things: a detector's file alone asks for the detector."""
+    check_choice("--names", run.names, ("none", "detector", "open"))
+    if run.names == "none":
+        return None if run.detector is None else "detector"
+    return run.names
+
+
+def _unnamed(memory: Path) -> list[str]:
+    """Say how many things have no name, and how to get names."""
+    with Store.open(memory) as store:
+        things = [i for i in store.instances.all() if i.structure is None and i.state != "removed"]
+    missing = sum(i.label is None for i in things)
+    how = f"`list3r names {memory} --by detector` looks for 80 kinds of things (2 MB are fetched once)"
+    return [f"{missing} of {len(things)} things have no name; {how}"] if missing else []
 
 
 def load_detector(file: Path, classes: Path | None) -> NanoDet:

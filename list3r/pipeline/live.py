@@ -151,7 +151,7 @@ def build_live(
             with store.transaction():
                 store.sessions.put(replace(store.sessions.get(ours.session), frame_count=state.count))
             report = _report(ours, state, started)
-    return finish(report, memory, feed.folder, first, replace(run, detector=None), watch)
+    return finish(report, memory, feed.folder, first, replace(run, detector=None, names="none"), watch)
 
 
 @contextmanager

@@ -159,6 +159,13 @@ class RunOptions:
             "ANCHOR",
         ),
     )
+    names: str = field(
+        default="none",
+        metadata=option(
+            "Who names things: detector (NanoDet, 2 MB are fetched once) or open (OWLv2, about 0.6 GB).",
+            "none|detector|open",
+        ),
+    )
     detector: Path | None = field(
         default=None,
         metadata=option("A NanoDet box detector for ncnn (.param, with its .bin beside it) that names things.", "FILE"),
@@ -188,6 +195,7 @@ class RunArguments(TypedDict, total=False):
     engine: str
     address: str | None
     scale_anchor: str | None
+    names: str
     detector: Path | None
     detector_classes: Path | None
     live: bool

@@ -133,7 +133,7 @@ def prepare(
     session, but for what is asked for.
     """
     options = options or SourceOptions()
-    check_run(run)
+    check_run(run, lambda line: (watch or Watch()).tell([line]))
     opened = open_source(source, options, (watch or Watch()).looking("frames"))
     info = opened.info
     options.check_fits(info)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.core.description.nouns import kinds_of
 from list3r.memory.core.description.spelling import adjectives, split_words
 from list3r.memory.core.description.words import kind_word, vocabulary
 from list3r.memory.core.errors import OptionError, UnknownIdError
@@ -28,6 +29,8 @@ from list3r.queries.views.gather import Gathered, gather, is_large, sample
 
 _EQUAL = 0.02
 """Difference of two scores below which two answers are equally good."""
+_PERHAPS = 0.4
+"""How well what is known by its kind alone answers for one name of that kind."""
 _LOOK = 0.8
 """Most that likeness to words counts."""
 _MOST_LABELLED = 1_000
@@ -150,6 +153,7 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
     if shared is not None and best:  # which is larger, the sofa or the armchair
         best = {c.instance.id: c for c in ordered(search, list(best.values()), shared, [])}
     exact = bool(best) and not by_look
+    best = (_perhaps(store, question, viewpoint) if exact else {}) | best
     if not any(_says_something(p) for p in question.phrases) and question.kind == "which":
         return Found((), ["say what to look for, such as: white mug on table"])
     if not best:
@@ -167,6 +171,21 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
             out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
     if not exact and ranked:
         out.notes = (*out.notes, "nothing fits; these are the nearest by " + ("look" if by_look else "meaning"))
+    return out
+
+
+def _perhaps(store: Store, question: Question, viewpoint: Place | None) -> dict[int, PhraseMatch]:
+    """Return what may be meant, for nothing but its kind is known: the "seat" that can be a chair."""
+    asked = [p for p in question.phrases if p.meant and p.order is None and p.use is None]
+    named = store.detected_labels.all() if asked and question.kind == "which" else {}
+    branches = {n: d.label for n, d in named.items() if d.level == "branch"}
+    out = {}
+    for phrase in asked:
+        for kind in sorted(set(branches.values()).intersection(*map(kinds_of, phrase.meant))):
+            found, _ = meant(store, replace(phrase, noun=tuple(split_words(kind)), meant=(kind,)), viewpoint)
+            why = f"may be a {phrase.meant[0]}: all that is known is that it is a {kind}"
+            for c in (c for c in found if branches.get(c.instance.id) == kind):
+                out[c.instance.id] = PhraseMatch(c.instance, c.score * _PERHAPS, (*c.reasons[1:], why))
     return out
 
 

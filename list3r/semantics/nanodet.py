@@ -19,12 +19,28 @@ from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.core.description.coco import COCO_80
 from list3r.memory.core.errors import OptionError, install_hint
 from list3r.semantics.detector import Detections
+from list3r.weights import PublishedFile
 
 _MEAN_BGR = (103.53, 116.28, 123.675)
 _STD_BGR = (57.375, 57.12, 58.395)
 _INPUT_SIDE = 320
 """Side of the square pictures that NanoDet is trained on, unless the file's name says another (nanodet-m-416)."""
 _GRID = re.compile(r"cls_pred_stride_(\d+)$")
+
+
+_ASSETS = (
+    "https://raw.githubusercontent.com/nihui/ncnn-android-nanodet/7e1ff26429c07b6a9de31fb9323a866d37597034"
+    "/app/src/main/assets/"
+)
+PUBLISHED = {
+    "nanodet-m-416.param": PublishedFile(
+        _ASSETS + "nanodet-m.param", "c1e7f51fd49b90b275cb6d585ea93c7d915cbfbe17874054abb57403afb9043b", 13_710
+    ),
+    "nanodet-m-416.bin": PublishedFile(
+        _ASSETS + "nanodet-m-416.bin", "87e4e78c6ecaf94cfffc3f7c8dd73f85beb0b185cd14962fb4d05dd8b1249571", 1_901_612
+    ),
+}
+"""The network for pictures of 416 px, by file; its description is the same for 320 px."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class TextImageModel:
         self._device = pick_device(device)
         kind = model_type(folder)
         self._network = load_pretrained(CLASSES[kind], folder, self._device)
-        self._tokenizer = _tokenizer(folder)
+        self._tokenizer = load_tokenizer(folder)
         self._siglip = kind == "siglip"
         config = self._network.config
         size = int(config.vision_config.image_size)
@@ -117,7 +117,8 @@ def decode_jpeg(data: bytes) -> NDArray[np.uint8] | None:
     return None if found is None else np.ascontiguousarray(found[..., ::-1])
 
 
-def _tokenizer(folder: Path) -> Any:
+def load_tokenizer(folder: Path) -> Any:
+    """Return the tokenizer of a folder. Raises `OptionError`."""
     from transformers import AutoTokenizer
 
     try:

@@ -184,6 +184,7 @@ def show(
 
 def _named_by(instance: Instance, named: DetectedLabel | None) -> str:
     who = "an operator" if named is None else f"{named.detector}, confidence {named.confidence:.2f}"
+    who += ", as no more than a kind of thing" if named is not None and named.level == "branch" else ""
     return f"{who}; it looks like {instance.description}"
 
 

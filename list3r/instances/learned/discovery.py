@@ -28,9 +28,9 @@ Features = NDArray[np.float32]
 """Unit features of T objects. Shape (T, D)."""
 OFF_WALL = 4.0
 """Voxels, added to three deviations of depth, beyond which a point is not on the plane of a wall or floor."""
-MOST_NAMES = 3
+MOST_NAMES = 8
 """Names kept per object at most,"""
-LEAST_NAME = 0.02
+LEAST_NAME = 0.01
 """and how probable they are at least."""
 FLAT = 0.85
 """Share of an object's voxels near its plane from which it is a flat surface."""
@@ -145,8 +145,8 @@ def _faces(cloud: Cloud, mine: NDArray[np.int64], planes: Sequence[Plane]) -> li
     return faces
 
 
-def _named(scores: SegmentVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
-    """The likeliest names of each object with their probabilities; none for structure.
+def named(scores: SegmentVerdicts, names: Sequence[str]) -> list[tuple[tuple[str, float], ...]]:
+    """Return the likeliest names of each object with their probabilities; none for structure.
 
     Uncertain ones are kept: the name is decided over all chunks.
     """
@@ -165,14 +165,14 @@ def _described(
     rgb, count = np.clip(np.rint(cloud.rgb), 0, 255).astype(np.uint8), len(cut.verdicts.structure)
     order = np.argsort(cut.labels, kind="stable")
     bounds = np.searchsorted(cut.labels[order], np.arange(count + 1))
-    segments, features, named = [], np.zeros((count, 64), np.float32), _named(cut.verdicts, names)
+    segments, features, likely = [], np.zeros((count, 64), np.float32), named(cut.verdicts, names)
     for number in range(count):
         mine = order[bounds[number] : bounds[number + 1]]
         structure = bool(cut.verdicts.structure[number] > 0.5)
         features[number] = object_feature(cloud.points[mine], rgb[mine], up, unit)
         plane = _plane_of(cloud, mine, unit)
         score = 0.95 if structure else float(cut.verdicts.whole[number])
-        segments.append(Segment(plane, structure, score, named=named[number]))
+        segments.append(Segment(plane, structure, score, named=likely[number]))
     return Segmentation(np.asarray(cut.labels + 1, np.int32), tuple(segments), up), features
 
 

@@ -507,6 +507,8 @@ class DetectedLabel:
     """Independent pictures in which it was found, weighted."""
     detector: str
     """Who found it, by name, with commas between several."""
+    level: str = "leaf"
+    """leaf: the name of a thing; branch: only a kind of things ("seat"), where no name in it is sure enough."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from list3r.memory.core.constraints import Key
+from list3r.memory.core.description.nouns import is_a, kinds_of, nouns_of
 from list3r.memory.core.records import DetectedLabel, Instance, Votes
 from list3r.memory.core.settings import stored_settings
 from list3r.memory.store.store import Store
@@ -36,6 +37,8 @@ class LabelSettings:
     min_own: float = 0.63
     """The same where only the learned discoverer names it: 0.65 of what it says, the highest at which 0.6 of the things
     of left-out rooms are named (decision 0144)."""
+    min_branch: float = 0.95
+    """Probability of a kind of things ("seat") where no name is probable enough: those of the names in it, summed."""
     likeness: float = 0.4
     """Correlation of what a detector says in two pictures of one instance: n pictures say as much as n / (1 + likeness
     (n - 1)) of different ones would, never more than 1 / likeness (decision 0024)."""
@@ -113,19 +116,50 @@ def decide(
     class. The classes exclude one another and all of them may be wrong, which has the odds of 1.
     """
     s = settings or LabelSettings()
+    probable = _probabilities(votes, known, s)
+    if not probable:
+        return None
+    best = min(probable, key=lambda c: (-probable[c][0], c))
+    confidence, found = probable[best]
+    return (best, confidence, found) if confidence >= s.min_confidence and found >= s.min_found else None
+
+
+def decide_kind(
+    votes: Mapping[str, Votes],
+    known: Mapping[str, Collection[str] | None] | None = None,
+    settings: LabelSettings | None = None,
+) -> tuple[str, float, float] | None:
+    """Return what `decide` does for the narrowest kind of thing that is probable enough: "seat" of chair and stool.
+
+    A kind is as probable as all names in it together.
+    """
+    s = settings or LabelSettings()
+    kinds: dict[str, tuple[float, float]] = {}
+    for name, (p, found) in sorted(_probabilities(votes, known, s).items()):
+        noun = next(iter(nouns_of(name)), None)
+        for kind in () if noun is None else dict.fromkeys((noun, *kinds_of(noun))):
+            total, most = kinds.get(kind, (0.0, 0.0))
+            kinds[kind] = total + p, max(most, found)
+    sure = [k for k, (p, found) in kinds.items() if p >= s.min_branch and found >= s.min_found]
+    if not sure:
+        return None
+    best = min(sure, key=lambda k: (-len(kinds_of(k)), -kinds[k][0], k))
+    return (best, *kinds[best])
+
+
+def _probabilities(
+    votes: Mapping[str, Votes], known: Mapping[str, Collection[str] | None] | None, s: LabelSettings
+) -> dict[str, tuple[float, float]]:
+    """Return by class its probability and in how many pictures it was found."""
     odds: dict[str, float] = {}
     found: dict[str, float] = {}
     for name in sorted({c for v in votes.values() for c in v.classes}):
         said = [_said(v, name, source, (known or {}).get(source), s.likeness) for source, v in sorted(votes.items())]
         odds[name] = PRIOR_ODDS + sum(evidence for _, evidence in said)
         found[name] = sum(pictures for pictures, _ in said)
-    if not odds:
-        return None
-    top = max(0.0, *odds.values())
+    top = max(0.0, *odds.values()) if odds else 0.0
     total = math.exp(-top) + sum(math.exp(v - top) for v in odds.values())
-    best = min(odds, key=lambda c: (-odds[c], c))
-    confidence = (1.0 - s.always_wrong) * math.exp(odds[best] - top) / total
-    return (best, confidence, found[best]) if confidence >= s.min_confidence and found[best] >= s.min_found else None
+    return {c: ((1.0 - s.always_wrong) * math.exp(v - top) / total, found[c]) for c, v in odds.items()}
 
 
 def decide_by_rank(
@@ -155,8 +189,12 @@ def label_source(instance: Instance, detected: DetectedLabel | None) -> dict[str
     if instance.label is None:
         return {}
     if detected is None:
-        return {"label_source": "operator", "label_confidence": 1.0}
-    return {"label_source": detected.detector, "label_confidence": round(detected.confidence, 4)}
+        return {"label_source": "operator", "label_confidence": 1.0, "label_level": "leaf"}
+    return {
+        "label_source": detected.detector,
+        "label_confidence": round(detected.confidence, 4),
+        "label_level": detected.level,
+    }
 
 
 def apply_labels(
@@ -215,11 +253,13 @@ def _label(
     total: dict[str, Votes] = {}
     for chunk_id, local_id in sorted(keys):
         _add(total, votes.get(chunk_id, {}), local_id)
-    chosen = decide_by_rank(total, known, settings)
+    leaf = decide_by_rank(total, known, settings)
+    chosen = leaf or decide_kind(total, known, settings)
     if chosen is None:
         return None
     name, confidence, pictures = chosen
-    return DetectedLabel(name, confidence, pictures, ", ".join(s for s in sorted(total) if name in total[s].classes))
+    said = [s for s in sorted(total) if any(name == c or (leaf is None and is_a(c, name)) for c in total[s].classes)]
+    return DetectedLabel(name, confidence, pictures, ", ".join(said), "branch" if leaf is None else "leaf")
 
 
 def _named_by_operators(store: Store, home: Mapping[Key, int]) -> Collection[int]:

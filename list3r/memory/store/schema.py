@@ -168,6 +168,10 @@ MIGRATIONS: tuple[str, ...] = (
             e.confidence, e.reason
         FROM events e JOIN instances i ON i.id = e.instance JOIN sessions s USING (session_id);
     """,
+    # 2: labels that name only a kind of things
+    """
+    ALTER TABLE detected_labels ADD COLUMN level TEXT NOT NULL DEFAULT 'leaf' CHECK (level IN ('leaf', 'branch'));
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)
