@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.memory.core.errors import ExportError, OptionError, SourceError
+from list3r.memory.core.errors import ExportError, FrameError, SourceError
 from list3r.reconstruction.feedforward.pictures import CutSize, WidthSize
 from list3r.reconstruction.outputs.base import OutputOptions
-from list3r.reconstruction.outputs.exr import read_exr
 from list3r.reconstruction.outputs.registry import convert_predictions
 from list3r.reconstruction.precomputed import open_folder
 from list3r.reconstruction.precomputed_files import Piece, read_piece
+from tests.recordings import exr
 from tests.rgbd_scenes import walk
 
 HEIGHT, WIDTH = 24, 32
@@ -119,29 +117,6 @@ def save_scal3r(path: Path, T: np.ndarray) -> Path:
     return path
 
 
-def exr(z: np.ndarray, compression: int = 3) -> bytes:
-    """An image of one channel of floats in OpenEXR."""
-    height, width = z.shape
-
-    def attribute(name: str, kind: str, value: bytes) -> bytes:
-        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<I", len(value)) + value
-
-    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    channels = b"Y\0" + struct.pack("<iIii", 2, 0, 1, 1) + b"\0"
-    head = struct.pack("<II", 20000630, 2) + attribute("channels", "chlist", channels)
-    head += attribute("compression", "compression", bytes([compression])) + attribute("dataWindow", "box2i", box)
-    head += attribute("lineOrder", "lineOrder", b"\0") + b"\0"
-    blocks, lines = [], 16 if compression else 1
-    for y in range(0, height, lines):
-        raw = np.frombuffer(z[y : y + lines].astype("<f4").tobytes(), np.uint8)
-        parted = np.concatenate([raw[::2], raw[1::2]]).astype(np.int64)
-        steps = np.diff(parted, prepend=0) + np.r_[0, np.full(len(parted) - 1, 128)]
-        body = zlib.compress(steps.astype(np.uint8).tobytes()) if compression else raw.tobytes()
-        blocks.append(struct.pack("<iI", y, len(body)) + body)
-    starts = np.cumsum([len(head) + 8 * len(blocks), *(len(b) for b in blocks[:-1])])
-    return head + b"".join(struct.pack("<Q", int(s)) for s in starts) + b"".join(blocks)
-
-
 SAVERS: dict[str, tuple[Saver, str]] = {
     "vggt": (save_vggt, "vggt"),
     "da3": (save_da3, "da3"),
@@ -209,16 +184,14 @@ def test_masks_of_entitysam_are_things_throughout_the_video(tmp_path: Path) -> N
     assert not (tmp_path / "again").exists()
 
 
-@pytest.mark.parametrize("compression", [0, 3])
-def test_depth_images_in_openexr_are_read_and_damaged_ones_refused(compression: int, tmp_path: Path) -> None:
-    z = np.random.default_rng(1).random((37, 21)).astype(np.float32)
-    data = exr(z, compression)
-    (tmp_path / "z.exr").write_bytes(data)
-    assert np.array_equal(read_exr(tmp_path / "z.exr"), z)
-    for damaged in (data[:200], b"RIFF" + data[4:], data[:-900]):
-        (tmp_path / "z.exr").write_bytes(damaged)
-        with pytest.raises(OptionError, match="OpenEXR"):
-            read_exr(tmp_path / "z.exr")
+@pytest.mark.parametrize("damage", [lambda data: data[:200], lambda data: b"RIFF" + data[4:], lambda data: data[:-900]])
+def test_a_damaged_depth_image_of_scal3r_is_refused(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    path = save_scal3r(tmp_path / "saved", np.tile(np.eye(4), (3, 1, 1)))
+    image = path / "depths" / "000001.exr"
+    image.write_bytes(damage(image.read_bytes()))
+    with pytest.raises(FrameError, match=r"000001\.exr"):
+        convert_predictions(path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_is_none_is_refused_and_leaves_nothing(tmp_path: Path) -> None:

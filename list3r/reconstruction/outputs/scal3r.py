@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from list3r.frames.decoding.decode import read_raw_depth
 from list3r.frames.files import read_file
 from list3r.memory.core.errors import SourceError
 from list3r.reconstruction.feedforward.pictures import WidthSize
 from list3r.reconstruction.outputs.base import Array, OutputOptions, ProgramOutput, Views, from_corner
-from list3r.reconstruction.outputs.exr import read_exr
 from list3r.reconstruction.precomputed_files import Manifest, Piece
 
 _MOST_TEXT = 2**28
@@ -41,7 +41,7 @@ class Scal3rReader:
 
         def pieces() -> Iterator[Piece]:
             for n in range(len(T)):
-                depth = read_exr(path / "depths" / f"{n:06d}.exr")
+                depth = np.asarray(read_raw_depth(path / "depths" / f"{n:06d}.exr"), np.float32)
                 scaled = K[n : n + 1].copy()
                 scaled[:, 0] *= depth.shape[1] / (2 * scaled[:, 0, 2, None])
                 scaled[:, 1] *= depth.shape[0] / (2 * scaled[:, 1, 2, None])
