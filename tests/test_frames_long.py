@@ -38,10 +38,11 @@ def test_a_name_or_link_that_leads_out_is_refused(name: str, tmp_path: Path) -> 
         inside(root, name, root)
 
 
-def test_the_fingerprint_of_a_list_is_what_it_was() -> None:
-    rows = [("a'b.jpg", 3), ("ü.png", -1)]
-    assert fingerprint("tum", iter(rows), SourceOptions()) == "448e26ca744dd0517f9e004f3a10c4a1"
-    assert len({fingerprint("tum", listing, SourceOptions()) for listing in (rows, rows[:1], [])}) == 3
+def test_names_sizes_and_options_shape_the_fingerprint() -> None:
+    rows, given = [("a'b.jpg", 3), ("ü.png", -1)], SourceOptions()
+    assert fingerprint("tum", iter(rows), given) == fingerprint("tum", rows, SourceOptions(kind="tum"))
+    cases = [(rows, given), (rows[:1], given), ([], given), (rows[::-1], given), (rows, SourceOptions(fps=5.0))]
+    assert len({fingerprint("tum", listing, options) for listing, options in cases}) == 5
 
 
 def frame_files(count: int) -> Iterator[FrameFile]:

@@ -101,18 +101,3 @@ def test_settings_that_cannot_be_read_are_one_line(tmp_path: Path) -> None:
             stored_settings(store, AssociationSettings, "association")
         with pytest.raises(MemoryFileError, match="session 1"):
             session_settings(store.sessions.all()[0])
-
-
-def test_what_is_stored_under_a_former_name_is_read() -> None:
-    rgbd, sfm = BuildSettings().models.rgbd, BuildSettings().models.sfm
-    mapping = replace(sfm.mapping, given_angle_deg=4.0, given_steps=(2, 3), given_pairs=5)
-    chosen = replace(rgbd, movers=replace(rgbd.movers, votes=3), mover_tracks=replace(rgbd.mover_tracks, min_frames=9))
-    models = replace(BuildSettings().models, rgbd=chosen, sfm=replace(sfm, mapping=mapping))
-    settings = BuildSettings(models=models)
-    before = settings.as_plain()
-    plain = before["models"]["sfm"]["mapping"]
-    for now, former in (("given_angle_deg", "told_angle_deg"), ("given_steps", "told_steps"), ("given_pairs", "told")):
-        plain[former] = plain.pop(now)
-    plain = before["models"]["rgbd"]
-    plain["moving"], plain["follow"] = plain.pop("movers"), plain.pop("mover_tracks")
-    assert from_plain(BuildSettings, before) == settings

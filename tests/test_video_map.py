@@ -22,7 +22,7 @@ from list3r.frames.base import Camera
 from list3r.frames.chunking.chunks import ChunkSettings, plan_chunks
 from list3r.frames.source import open_source
 from list3r.memory.core.geometry import Sim3, umeyama
-from list3r.memory.core.records import ChunkRow, FrameSamples
+from list3r.memory.core.records import FrameSamples
 from list3r.pipeline.chunks.whole_map import map_spans
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.sfm.adjustment import adjust
@@ -217,19 +217,10 @@ def test_a_walk_of_wide_steps_neither_moves_nor_turns_farther_than_its_steps() -
     assert moved.max() < 0.09 and turned.max() < 4.6 and np.median(np.maximum(moved / 0.08, turned / 4.0)) > 0.9
 
 
-def test_chunks_of_a_mapped_video_are_even_unless_it_was_begun_or_asked_otherwise(tmp_path: Path) -> None:
+def test_chunks_of_a_mapped_video_are_even_unless_lengths_were_asked_for(tmp_path: Path) -> None:
     for k in range(120):
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), np.full((8, 8, 3), k, np.uint8))
     source, settings = open_source(tmp_path), BuildSettings("sfm")
     usual = plan_chunks(120, settings.chunks)
-
-    def spans(*last: int, asked: BuildSettings = settings) -> list[tuple[int, int]]:
-        begun = [
-            ChunkRow(k + 1, 1, k, 0, n, 1, Sim3.identity(), (1.0, 1.0, 0.0, 0.0), (8, 8), "relative")
-            for k, n in enumerate(last)
-        ]
-        return [(s.start, s.stop) for s in map_spans(source, asked, usual, begun)]
-
-    even, before = [(0, 66), (54, 120)], [(s.start, s.stop) for s in usual]
-    assert spans() == spans(65) == even and spans(99) == before
-    assert spans(asked=replace(settings, chunks=ChunkSettings(80, 30))) == before
+    assert [(s.start, s.stop) for s in map_spans(source, settings, usual)] == [(0, 66), (54, 120)]
+    assert map_spans(source, replace(settings, chunks=ChunkSettings(80, 30)), usual) == usual

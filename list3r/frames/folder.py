@@ -42,8 +42,6 @@ from list3r.frames.unread import not_read, not_read_note
 from list3r.memory.core.errors import FrameError, SourceError
 
 DEFAULT_FPS = 30.0
-_LATER = ("start_s", "end_s", "sharpest", "max_side", "topics", "more", "episode")
-"""Options that came later: unsaid, they leave the fingerprints of older memories as they were."""
 _PROBES = 9
 _LEAST_M, _MOST_M = 0.1, 30.0
 _POSES_TRIED = 50
@@ -490,11 +488,9 @@ def reduced_note(rig: Rig) -> str:
 
 def fingerprint(kind: str, listing: Iterable[tuple[str, int]], options: SourceOptions) -> str:
     """Hash of the files' names and sizes and of every option that shapes frames. 32 hexadecimal digits."""
-    given = {k: v for k, v in asdict(replace(options, kind="auto")).items() if v is not None or k not in _LATER}
-    found = hashlib.sha256(f"({kind!r}, [".encode())  # as the text of a tuple that is never whole in memory
-    for number, row in enumerate(listing):
-        found.update((", " if number else "").encode() + repr(row).encode())
-    found.update(f"], {sorted(given.items())!r})".encode())
+    found = hashlib.sha256(repr((kind, sorted(asdict(replace(options, kind="auto")).items()))).encode())
+    for row in listing:
+        found.update(repr(row).encode())
     return found.hexdigest()[:32]
 
 

@@ -170,10 +170,10 @@ def plan_session(store: Store, session: int, job: Job, watch: Watch, pool: Chunk
     count = job.info.frame_count
     cuts = _cuts(store, session, job, watch)
     step = settled_step(store, session, job, watch)
-    spans, begun = plan_chunks(count, job.settings.chunks.times(step), cuts), store.chunks.all(session)
-    done = {c.index for c in begun}
+    spans = plan_chunks(count, job.settings.chunks.times(step), cuts)
+    done = {c.index for c in store.chunks.all(session)}
     wide = step == 1 and not cuts and takes_wide_steps(job.frames(), job.settings)
-    shorter = map_spans(job.frames(), job.settings, spans, begun) if wide else spans
+    shorter = map_spans(job.frames(), job.settings, spans) if wide else spans
     left = next((s for s in shorter if s.index not in done), None)
     options, whole = _camera_and_map(store, session, job, watch, pool, wide=wide and left is not None)
     if whole is not None or left is None:

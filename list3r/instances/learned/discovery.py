@@ -51,7 +51,7 @@ class LearnedSettings:
     plane_area_m2: float = 0.25
     """Smallest flat surface searched for, to estimate gravity and to separate structure."""
     cut: CutSettings = field(default_factory=CutSettings)
-    depth_errors: DepthErrorSettings = field(default_factory=DepthErrorSettings, metadata={"formerly": "doubt"})
+    depth_errors: DepthErrorSettings = field(default_factory=DepthErrorSettings)
     """Of computed depth."""
 
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
-from list3r.frames.base import FrameSource, index_at
+from list3r.frames.base import FrameSource
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan, even_chunks
-from list3r.memory.core.records import ChunkRow
 from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.registry import entry
 
@@ -35,15 +34,9 @@ def map_whole(source: FrameSource, settings: BuildSettings) -> VideoMap | None:
         return map_source(source, settings.models.sfm, settings.video_map)
 
 
-def map_spans(
-    source: FrameSource, settings: BuildSettings, usual: Sequence[ChunkSpan], begun: Sequence[ChunkRow]
-) -> list[ChunkSpan]:
+def map_spans(source: FrameSource, settings: BuildSettings, usual: Sequence[ChunkSpan]) -> list[ChunkSpan]:
     """Return the chunks of a video whose map tells their poses: of even length, so that processes end together, and
-    with little overlap. Where lengths were asked for, or a version before began with longer ones, the `usual` ones.
-    """
+    with little overlap; the `usual` ones where lengths were asked for."""
     if settings.chunks != ChunkSettings():
         return list(usual)
-    spans = even_chunks(source.info.frame_count, settings.video_map.chunks)
-    last = {row.index: row.last_frame for row in begun}
-    longer = (last[s.index] > index_at(source, s.stop - 1) for s in spans if s.index in last)
-    return list(usual) if any(longer) else spans
+    return even_chunks(source.info.frame_count, settings.video_map.chunks)

@@ -134,7 +134,7 @@ class RgbdSettings:
 
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
-    movers: FreeSpaceMoverSettings = field(default_factory=FreeSpaceMoverSettings, metadata={"formerly": "moving"})
-    mover_tracks: MoverTrackSettings = field(default_factory=MoverTrackSettings, metadata={"formerly": "follow"})
+    movers: FreeSpaceMoverSettings = field(default_factory=FreeSpaceMoverSettings)
+    mover_tracks: MoverTrackSettings = field(default_factory=MoverTrackSettings)
     most_step: int = 2
     """Largest step between frames of a slow video that get depth, unless another is asked for (research/speed 0159)."""

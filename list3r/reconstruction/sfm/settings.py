@@ -149,11 +149,11 @@ class MappingSettings:
     """Largest error of an observation that is kept."""
     first_angle_deg: float = 6.0
     """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
-    given_angle_deg: float = field(default=3.0, metadata={"formerly": "told_angle_deg"})
+    given_angle_deg: float = 3.0
     """The same where the pair is given, or the camera is estimated as well."""
-    given_steps: tuple[int, int] = field(default=(4, 7), metadata={"formerly": "told_steps"})
+    given_steps: tuple[int, int] = (4, 7)
     """Fewest and most keyframes from the first to the second one of a given pair."""
-    given_pairs: int = field(default=2, metadata={"formerly": "told"})
+    given_pairs: int = 2
     """Most pairs from which a map is grown in addition to the one that the mapper chooses."""
     steady: float = 0.0
     """No other pair is tried where the points' depth changes by less than this factor from each keyframe to the next;

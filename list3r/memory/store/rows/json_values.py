@@ -46,8 +46,7 @@ _NUMBERS = frozenset((int, float))
 def typed(hint: Any, value: object, *, lenient: bool = False) -> Any:
     """Return what `plain` made of a value of that type; a field that is not there keeps its default.
 
-    A field is also found by its `formerly`, a former name in its metadata. Raises `ValueError` for anything else. Where
-    it is `lenient`, fields that a record does not know are left out.
+    Raises `ValueError` for anything else. Where it is `lenient`, fields that a record does not know are left out.
     """
     origin, inner = get_origin(hint), get_args(hint)
     if hint in (Any, object):
@@ -83,9 +82,7 @@ def _generic(origin: Any, inner: tuple[Any, ...], value: object, lenient: bool) 
 
 
 def _record(record: Any, values: Mapping[str, Any], lenient: bool) -> Any:
-    hints, renamed = _hints(record), _renamed(record)
-    if renamed:
-        values = {renamed.get(name, name): value for name, value in values.items()}
+    hints = _hints(record)
     unknown = values.keys() - hints.keys()
     if unknown and not lenient:
         raise ValueError(f"{sorted(unknown)[0]!r} is not known")
@@ -96,12 +93,6 @@ def _record(record: Any, values: Mapping[str, Any], lenient: bool) -> Any:
 def _hints(record: Any) -> dict[str, Any]:
     hints = get_type_hints(record)
     return {f.name: hints[f.name] for f in fields(record) if f.init}
-
-
-@cache
-def _renamed(record: Any) -> dict[str, str]:
-    """Return the fields of a record that had another name once (`formerly` in their metadata), by that name."""
-    return {f.metadata["formerly"]: f.name for f in fields(record) if "formerly" in f.metadata}
 
 
 def _key(hint: Any, key: str) -> Any:
