@@ -198,10 +198,10 @@ def _draw_rooms(ax: Axes, view: PlanView, store: Store) -> None:
         corners = view.on_page(np.column_stack([room.outline, np.full(len(room.outline), room.floor_z)]))
         style = (0, (4, 3)) if room.partial else "-"
         ax.add_patch(Polygon(corners, fill=False, ec=_ROOM, lw=1.4, ls=style, alpha=0.8, zorder=2.5))
-        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        x, y = (corners.min(axis=0) + corners.max(axis=0)) / 2
         name = shown(room.name or f"room {room.id}")
         halo = [matplotlib.patheffects.withStroke(linewidth=3, foreground="white", alpha=0.8)]
-        ax.text(*middle, name, color=_ROOM, size=12, ha="center", va="center", zorder=4.5, path_effects=halo)
+        ax.text(x, y, name, color=_ROOM, size=12, ha="center", va="center", zorder=4.5, path_effects=halo)
     for d in store.rooms.doorways():
         ax.plot(*view.on_page(d.position), "D", color=_ROOM, ms=5, mfc="white", zorder=4)
 
