@@ -396,7 +396,7 @@ def test_a_click_on_a_thing_selects_it(browser: Browser, room: Path) -> None:
             browser.says("Click an instance, or search for one.")
             browser.wait(viewer.server.get_clients)
             time.sleep(5.0)  # the page sets its first camera after it has connected
-            viewer.select(CHAIR, look=True)
+            viewer.select(CHAIR, turn=True)
             browser.says("5 chair")
             viewer.select(None)
             browser.says("Click an instance, or search for one.")
