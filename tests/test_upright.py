@@ -210,6 +210,10 @@ def test_build_takes_a_direction_of_the_first_camera(tmp_path: Path, capsys: pyt
         np.testing.assert_allclose(-scene.store.trajectory.poses()[0][1].rotation[:, 1], Z, atol=1e-6)
     assert run(["update", str(memory), str(walk), "--up", "camera"]) == 2
     assert "--up camera is for build" in capsys.readouterr().err
+    assert run(["update", str(memory), str(walk), "--association", "paper"]) == 2
+    assert "--association is for build" in capsys.readouterr().err
+    assert run([*build, "--association", "slam", "--force"]) == 2
+    assert "--association slam: choose from list3r, paper, frames" in capsys.readouterr().err
 
 
 def test_a_direction_is_read_and_nonsense_is_refused() -> None:
