@@ -237,7 +237,7 @@ def _judged(case: Case, rng: random.Random) -> tuple[str, list[str]]:
 
 def _list3r(command: str, path: Path) -> tuple[int, str, str]:
     """Status, output and errors of one command."""
-    words = [command, str(path)]
+    words = [*(["edit", "label"] if command == "label" else [command]), str(path)]
     if command == "label":
         words += ["2", "restored"]
     out, err = io.StringIO(), io.StringIO()

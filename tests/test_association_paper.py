@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.peers.point_maps import coverage_rank
 from list3r.association.graph.pose_graph import chain_poses
 from list3r.association.overlap.alignment import AlignmentSettings, align
 from list3r.association.overlap.inconsistency import displacement, inconsistency
 from list3r.association.overlap.regions import EdgeSupportSettings, Regions, confident
 from list3r.association.overlap.shared_points import Pairs
+from list3r.association.paper.support import coverage_turn
 from list3r.association.paper.weights import paper_weights
 from list3r.association.revisits.instance_similarity import (
     InstanceSet,
@@ -123,7 +123,7 @@ def test_coverage_sampling_takes_the_surest_of_each_cell_in_turn() -> None:
     x = np.array([0.0, 0.2, 0.4, 1.2, 2.0])
     points, weight = np.stack([x, 0 * x, 0 * x], axis=1), np.array([0.7, 0.9, 0.8, 0.1, 0.2])
     low, high = np.quantile(x, [0.05, 0.95])
-    rank = coverage_rank(points, weight, 1)
+    rank = coverage_turn(points, np.zeros(len(points), np.int64), weight, 1)
     assert high - low == pytest.approx(1.8)  # the cell: 0 to 1.8 holds four points, 2.0 lies alone
     assert rank.tolist() == [2, 0, 1, 3, 0]
 

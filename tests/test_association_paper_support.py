@@ -9,13 +9,13 @@ from list3r.association.overlap import overlap_edge
 from list3r.association.overlap.overlap_edge import EdgeEnd, EdgeSettings
 from list3r.association.overlap.regions import EdgeSupportSettings
 from list3r.association.overlap.shared_points import Pairs
-from list3r.association.paper.support import PaperSupportSettings, coverage_turn, sampled, without_large_delta
+from list3r.association.paper.support import coverage_turn, sampled, without_large_delta
 from list3r.frames.base import Camera
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import FrameSamples
 
 CAMERA = Camera(100, 80, 100.0, 100.0, 50.0, 40.0)
-SETTINGS, REGIONS = PaperSupportSettings(), EdgeSupportSettings()
+REGIONS = EdgeSupportSettings()
 
 
 def _pairs(p_u: np.ndarray, p_v: np.ndarray, instance: np.ndarray, confidence: np.ndarray | None = None) -> Pairs:
@@ -37,10 +37,10 @@ def test_an_instance_leaves_where_its_delta_is_large() -> None:
     p_v = p_u.copy()
     p_v[400:, 0] += 0.2
     thing = np.repeat(np.arange(5), 100)
-    found = without_large_delta(_pairs(p_u, p_v, thing), CAMERA, REGIONS, SETTINGS)
+    found = without_large_delta(_pairs(p_u, p_v, thing), CAMERA, REGIONS)
     assert found.left_out_u == {4} and found.removed.tolist() == (thing == 4).tolist()
     assert 0.5 < found.delta_max_px < 2.0
-    still = without_large_delta(_pairs(p_u, p_u, thing), CAMERA, REGIONS, SETTINGS)
+    still = without_large_delta(_pairs(p_u, p_u, thing), CAMERA, REGIONS)
     assert not still.removed.any() and still.delta_max_px == pytest.approx(0.0, abs=1e-6)
 
 
@@ -49,7 +49,7 @@ def test_what_has_no_instance_never_leaves() -> None:
     p_u = _grid(rng, 300)
     p_v = p_u.copy()
     p_v[200:, 0] += 0.5
-    found = without_large_delta(_pairs(p_u, p_v, np.full(300, -1)), CAMERA, REGIONS, SETTINGS)
+    found = without_large_delta(_pairs(p_u, p_v, np.full(300, -1)), CAMERA, REGIONS)
     assert not found.removed.any()
 
 
@@ -60,9 +60,8 @@ def test_cells_and_instances_are_sampled_in_turn_the_surest_first() -> None:
     weight = np.array([0.8, 0.9, 0.7, 0.6, 0.2, 0.3, 0.1])
     turn = coverage_turn(points, thing, weight, 16)
     assert turn.tolist() == [1, 0, 2, 3, 1, 0, 0]
-    few = PaperSupportSettings(sample=3)
     pairs = _pairs(points, points, thing, weight)
-    chosen = sampled(pairs, without_large_delta(pairs, CAMERA, REGIONS, few), few)
+    chosen = sampled(pairs, without_large_delta(pairs, CAMERA, REGIONS), 3)
     assert chosen.used.tolist() == [False, True, False, False, False, True, True]
     assert chosen.weight == pytest.approx([0.9, 0.3, 0.1])
 

@@ -204,8 +204,8 @@ def test_nearest_gives_surface_and_centre_distances(room: Path) -> None:
     assert first["center_distance"] == pytest.approx(0.13, abs=1e-6)
     assert second["center_distance"] > first["center_distance"]
     assert [m["id"] for m in ask("nearest", room, "3", "-k", "2")] == [2, 4]
-    assert {m["id"] for m in ask("nearest", room, "--words", "mug")} == {3, 4}
-    assert ask("nearest", room, "--words", "elephant") == []
+    assert {m["id"] for m in ask("nearest", room, "mug")} == {3, 4}
+    assert ask("nearest", room, "elephant") == []
     assert ask("nearest", room, "--point", "9,9,9", "--max-distance", "1") == []
 
 

@@ -209,7 +209,7 @@ MORE_CASES = {
     "a session of a box": ("within {p}/room.l3r --box 0,0,0,1,1,1 --session 9", "--session 9 needs a camera"),
     "who looks": ("find {p}/room.l3r mug --from here", "viewpoint 'here'"),
     "sizes that leave nothing": (
-        "nearest {p}/room.l3r --words mug --min-size 3 --max-size 1",
+        "nearest {p}/room.l3r mug --min-size 3 --max-size 1",
         "min_size 3 above max_size 1",
     ),
     "repair onto itself": ("repair {p}/torn.l3r --out {p}/torn.l3r", "the damaged file itself"),

@@ -232,7 +232,7 @@ LINES = st.tuples(
     st.lists(
         st.tuples(
             st.sampled_from(
-                "--words --point -k --radius --box --view --time --pose --session --from --object --and"
+                "--point -k --radius --box --view --time --pose --session --from --object --and"
                 " --predicate --max-depth --max-distance --label --color --min-size --structure --no-occlusion"
                 " --max-size --min-confidence --state --component --image --since --at --json".split()
             ),

@@ -188,7 +188,7 @@ def test_no_answer_names_a_folder_an_option_or_a_command(tmp_path: Path) -> None
         return [str((await client.call_tool(n, words)).content) for n, each in BAD.items() for words in each]
 
     for text in ask(path, told, write=True):
-        assert str(tmp_path) not in text and not re.search(r"(?<!\\w)--[a-z]|`list3r |Traceback", text), text
+        assert str(tmp_path) not in text and not re.search(r"(?<!\w)--[a-z]|`list3r |Traceback", text), text
 
 
 def test_tools_have_titles_and_answer_in_compact_json(room: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.overlap.alignment import Alignment, AlignmentSettings, align, robust_start
+from list3r.association.paper.support import coverage_turn
 from list3r.memory.core.errors import DegenerateError
 from list3r.memory.core.geometry import Sim3
 
@@ -68,7 +69,7 @@ def align_point_maps(
     S_v_u = robust_start(p_u, p_v, weight, group, metric, chosen.align)
     middle = (S_v_u.apply(p_u) + p_v) / 2.0
     weight = _worth(S_v_u, p_u, p_v, weight)
-    rank = coverage_rank(middle, weight, chosen.cells)
+    rank = coverage_turn(middle, np.zeros(len(middle), np.int64), weight, chosen.cells)
     rank[_contradicted(S_v_u, p_u, p_v, chosen.gate)] = len(rank)
     best = np.sort(np.argsort(rank, kind="stable")[: chosen.pairs])
     best = best[rank[best] < len(rank)]
@@ -112,17 +113,3 @@ def _contradicted(S_v_u: Sim3, p_u: NDArray[np.float64], p_v: NDArray[np.float64
     off = S_v_u.apply(p_u) - p_v
     square = np.einsum("ni,ni->n", off, off)
     return np.asarray(square > gate**2 * np.median(square) + 1e-12 * np.median(np.einsum("ni,ni->n", p_v, p_v)))
-
-
-def coverage_rank(points: NDArray[np.float64], weight: NDArray[np.float64], cells: int) -> NDArray[np.int64]:
-    """Place of each point in its cell, the heaviest first, `cells` of them across the spread. Taking points in order of
-    it gives each cell a like share. Shape (N,)."""
-    low, high = np.quantile(points, [0.05, 0.95], axis=0)
-    spread = max(float(np.linalg.norm(high - low)), 1e-300)
-    cell = np.floor((points - points.min(axis=0)) / (spread / cells)).astype(np.int64)
-    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
-    order = np.lexsort((-weight, key))
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    rank = np.empty(len(points), np.int64)
-    rank[order] = np.arange(len(points)) - np.repeat(starts, np.diff([*starts, len(points)]))
-    return rank

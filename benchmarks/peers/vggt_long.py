@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.association.overlap.shared_points import shared_samples
+from list3r.association.paper.plain_alignment import ratio_of_radii
 from list3r.association.revisits.joint_window import JointReconstructor
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import FrameSamples
@@ -191,13 +192,13 @@ def align(target: FrameSamples, source: FrameSamples, settings: VggtLongSettings
 
 def robust_similarity(source: Array, target: Array, weight: Array, settings: VggtLongSettings) -> Sim3:
     """Estimate `S_target_source` of corresponding points. Shapes (N, 3), (N, 3), (N,)."""
-    S = _weighted_similarity(source, target, weight)
+    S = ratio_of_radii(source, target, weight, metric=False)
     previous = np.inf
     for _ in range(settings.rounds):
         residual = np.linalg.norm(target - S.apply(source), axis=1)
         large = residual > settings.huber
         down = np.where(large, settings.huber / np.maximum(residual, 1e-300), 1.0)
-        new = _weighted_similarity(source, target, weight * down)
+        new = ratio_of_radii(source, target, weight * down, metric=False)
         change = abs(float(new.scale - S.scale)) + float(np.linalg.norm(new.translation - S.translation))
         angle = np.arccos(np.clip((np.trace(new.rotation @ S.rotation.T) - 1) / 2, -1, 1))
         loss = np.where(large, settings.huber * (residual - 0.5 * settings.huber), 0.5 * residual**2)
@@ -207,17 +208,6 @@ def robust_similarity(source: Array, target: Array, weight: Array, settings: Vgg
             break
         S, previous = new, cost
     return S
-
-
-def _weighted_similarity(source: Array, target: Array, weight: Array) -> Sim3:
-    w = weight / weight.sum()
-    mean_s, mean_t = w @ source, w @ target
-    s, t = source - mean_s, target - mean_t
-    scale = np.sqrt((w * (t**2).sum(axis=1)).sum() / (w * (s**2).sum(axis=1)).sum())
-    U, _, Vt = np.linalg.svd((s * w[:, None]).T @ t)
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
-    rotation = Vt.T @ turn @ U.T
-    return Sim3(np.asarray(scale), rotation, mean_t - scale * rotation @ mean_s)
 
 
 def optimise(

@@ -76,8 +76,9 @@ def settings_resumed(
             f"this session was begun with --discovery {settings.discovery}, which this version does not have; "
             "continue with --discovery learned"
         )
-    if request.association is not None:
-        settings = replace(settings, association=AssociationSettings.by_method(request.association))
+    asked = begun.association if request.association is None else AssociationSettings.by_method(request.association)
+    if asked != begun.association:
+        raise OptionError(f"this build was not begun with --association {request.association}; leave it out")
     if request.chunk is not None or request.overlap is not None:
         settings = replace(settings, chunks=_cut(settings, request.chunk, request.overlap))
     return settings, notes

@@ -146,6 +146,8 @@ def prepare(
         request = settings or BuildRequest()
         if later and request.up in ("camera", "unknown"):
             raise OptionError(f"--up {request.up} is for build: a memory has one way up; give x,y,z, or leave it out")
+        if later and request.association is not None:
+            raise OptionError("--association is for build: a memory is joined in one way; leave it out")
         if begun is not None:
             chosen, notes = settings_resumed(request, begun, info, run.licence)
         else:

@@ -18,7 +18,7 @@ from list3r.association.overlap.regions import EdgeSupportSettings, Mask, confid
 from list3r.association.overlap.shared_points import Pairs, shared_pairs
 from list3r.association.overlap.support import Fit, StaticSupport, static_support
 from list3r.association.paper.plain_alignment import plain_align
-from list3r.association.paper.support import PaperSupportSettings, sampled, without_large_delta
+from list3r.association.paper.support import sampled, without_large_delta
 from list3r.frames.base import Camera
 from list3r.memory.core.errors import DegenerateError
 from list3r.memory.core.geometry import Sim3
@@ -42,8 +42,6 @@ class EdgeSettings:
     """Pairs of a trial alignment."""
     support: EdgeSupportSettings = field(default_factory=EdgeSupportSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
-    paper: PaperSupportSettings = field(default_factory=PaperSupportSettings)
-    """Of the method paper."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +118,11 @@ def _aligned(
 ) -> tuple[StaticSupport, BalancedSupport, Alignment]:
     """Choose the support of an edge and align it; without instances where they leave too little."""
     if settings.method != "instances":
-        static, support = _confident_support(pairs, settings.support)
         if settings.method == "paper":
-            static = without_large_delta(pairs, camera, settings.support, settings.paper)
-            support = sampled(pairs, static, settings.paper)
+            static = without_large_delta(pairs, camera, settings.support)
+            support = sampled(pairs, static)
+        else:
+            static, support = _confident_support(pairs, settings.support)
         return static, support, plain_align(support.p_u, support.p_v, support.weight, support.frame, metric)
     static = static_support(pairs, camera, _trial_fit(metric, settings), settings.support, known)
     support = balanced_support(pairs, static, camera, settings.support)

@@ -29,10 +29,10 @@ def plain_align(p_u: Array, p_v: Array, weight: Array, group: NDArray[np.int64],
     Its covariance is that of a robust fit to the pairs within three robust deviations. Raises `DegenerateError` when
     the pairs have no weight or no extent.
     """
-    S_v_u = _ratio_of_radii(p_u, p_v, weight, metric)
+    S_v_u = ratio_of_radii(p_u, p_v, weight, metric)
     for _ in range(ROUNDS):
         residual = np.linalg.norm(S_v_u.apply(p_u) - p_v, axis=1)
-        S_v_u = _ratio_of_radii(p_u, p_v, weight * np.minimum(1.0, HUBER / np.maximum(residual, 1e-12)), metric)
+        S_v_u = ratio_of_radii(p_u, p_v, weight * np.minimum(1.0, HUBER / np.maximum(residual, 1e-12)), metric)
     residual = np.linalg.norm(S_v_u.apply(p_u) - p_v, axis=1)
     low, high = np.quantile(p_v, [0.05, 0.95], axis=0)
     spread = float(np.linalg.norm(high - low))
@@ -60,7 +60,11 @@ def _covariance(
     return measure_uncertainty(FittedPairs(p_u, q_u, weight, trust, limit, group), metric).covariance
 
 
-def _ratio_of_radii(p_u: Array, p_v: Array, weight: Array, metric: bool) -> Sim3:
+def ratio_of_radii(p_u: Array, p_v: Array, weight: Array, metric: bool) -> Sim3:
+    """Return the weighted similarity of pairs (N, 3), with the ratio of their RMS radii as scale.
+
+    Raises `DegenerateError` when the pairs have no weight or no extent.
+    """
     total = float(weight.sum())
     if not (np.isfinite(total) and total > 0):
         raise DegenerateError("no pair has a weight")

@@ -7,8 +7,6 @@ for the cells or for the size of the sample; those here are ours, and marked so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from list3r.association.overlap.balance import BalancedSupport
@@ -20,22 +18,15 @@ from list3r.association.paper.plain_alignment import plain_align
 from list3r.frames.base import Camera
 from list3r.memory.core.errors import DegenerateError
 
-
-@dataclass(frozen=True)
-class PaperSupportSettings:
-    """What the paper leaves open in its support of an edge."""
-
-    large: float = 3.0
-    """An instance leaves when its delta(o) is larger than so many times the median of all instances' ..."""
-    cells: int = 16
-    """Cells of space across the spread of the points, for coverage."""
-    sample: int = 6000
-    """Most pairs that are aligned."""
+LARGE = 3.0
+"""An instance leaves when its delta(o) is larger than so many times the median of all instances'."""
+CELLS = 16
+"""Cells of space across the spread of the points, for coverage."""
+SAMPLE = 6000
+"""Most pairs that are aligned."""
 
 
-def without_large_delta(
-    pairs: Pairs, camera: Camera, regions: EdgeSupportSettings, settings: PaperSupportSettings
-) -> StaticSupport:
+def without_large_delta(pairs: Pairs, camera: Camera, regions: EdgeSupportSettings) -> StaticSupport:
     """Leave out the instances with a large delta(o), by the masks of u. Raises `DegenerateError`."""
     sure = confident(pairs, regions)
     if not sure.any():
@@ -46,11 +37,7 @@ def without_large_delta(
     ids, of_pair, count = np.unique(pairs.instance_u[sure], return_inverse=True, return_counts=True)
     delta = np.bincount(of_pair.ravel(), off_px[sure]) / count
     judged = (ids >= 0) & (count >= regions.least_region_pairs)
-    limit = (
-        max(settings.large * float(np.median(delta[judged])), regions.least_pixels * camera.width)
-        if judged.any()
-        else 0.0
-    )
+    limit = max(LARGE * float(np.median(delta[judged])), regions.least_pixels * camera.width) if judged.any() else 0.0
     large = frozenset(ids[judged & (delta > limit)].tolist())
     nobody: frozenset[int] = frozenset()
     return StaticSupport(
@@ -65,11 +52,11 @@ def without_large_delta(
     )
 
 
-def sampled(pairs: Pairs, static: StaticSupport, settings: PaperSupportSettings) -> BalancedSupport:
+def sampled(pairs: Pairs, static: StaticSupport, most: int = SAMPLE) -> BalancedSupport:
     """Sample by confidence and coverage: the surest pairs of every cell of space and every instance in turn."""
     left = np.flatnonzero(static.confident & ~static.removed)
-    rank = coverage_turn(pairs.p_v[left], pairs.instance_u[left], pairs.weight[left], settings.cells)
-    rows = np.sort(left[np.argsort(rank, kind="stable")[: settings.sample]])
+    rank = coverage_turn(pairs.p_v[left], pairs.instance_u[left], pairs.weight[left], CELLS)
+    rows = np.sort(left[np.argsort(rank, kind="stable")[:most]])
     used = np.zeros(len(pairs), bool)
     used[rows] = True
     return BalancedSupport(pairs.p_u[rows], pairs.p_v[rows], pairs.weight[rows], pairs.frame[rows], used)

@@ -61,6 +61,13 @@ Session = Annotated[int | None, typer.Option("--session", help="The session of t
 MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="How far the camera sees.")]
 
 
+def id_or_words(text: str | None) -> tuple[int | None, str | None]:
+    """Return an argument as an id, where it is a number, or as words."""
+    if text is None:
+        return None, None
+    return (int(text), None) if text.isascii() and text.isdecimal() else (None, text)
+
+
 def region(
     box: str | None, point: str | None, radius: float | None, *, camera: bool
 ) -> dict[str, Sequence[float] | float]:

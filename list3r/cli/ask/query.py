@@ -50,11 +50,15 @@ def find(
 
 def nearest(
     memory: MemoryArgument,
-    instance_id: opt.OptionalId = None,
-    point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None,
-    words: Annotated[
-        str | None, typer.Option("--words", metavar="WORDS", help="Only instances that these words name, as in find.")
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ID|WORDS]",
+            help="The instance to be near to, by any id it ever had; or words: only instances that they name.",
+            show_default=False,
+        ),
     ] = None,
+    point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Distance from this point.")] = None,
     k: opt.Count = 5,
     max_distance: Annotated[
         float | None, typer.Option("--max-distance", help="Only instances whose surface is at most this far away.")
@@ -78,8 +82,9 @@ def nearest(
     """
     from list3r.memory.core.errors import OptionError
 
-    if words is None and point is None and instance_id is None:
-        raise OptionError("give a place: an ID, --point x,y,z, or --words such as mug")
+    if what is None and point is None:
+        raise OptionError("give a place: an ID, --point x,y,z, or words such as mug")
+    instance_id, words = opt.id_or_words(what)
     place = None if point is None else parse_point(point, "--point")
     if catalog is not None:
         many.refuse({"--max-distance": max_distance, "--component": component, "--room": room, "--at": at})

@@ -32,6 +32,7 @@ def answer_of_tools(answer: Mapping[str, Any], path: str = "") -> dict[str, Any]
     if "notes" in out:
         out["notes"] = [of_tools(note, path) for note in out["notes"]]
     if "matches" in out:
-        files = ("file", "path")
-        out["matches"] = [{k: PurePath(v).name if k in files else v for k, v in m.items()} for m in out["matches"]]
+        for match in (matches := [dict(m) for m in out["matches"]]):
+            match |= {k: PurePath(match[k]).name for k in ("file", "path") if isinstance(match.get(k), str)}
+        out["matches"] = matches
     return out
