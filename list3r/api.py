@@ -371,6 +371,17 @@ class SceneMemory(MemoryEdits):
         return self.store.surfaces.of(id_of(instance_id))
 
     @_alone
+    def footprint(self, instance_id: int | Instance) -> NDArray[np.float64]:
+        """Return the outline of what an instance covers as seen from above, world x and y, counterclockwise: an
+        L-shaped counter has six corners. Means something where `memory.gravity` is known. Shape (N, 2).
+
+        >>> memory.footprint(12)
+        """
+        from list3r.queries.views.footprint import footprints_of
+
+        return footprints_of(self.store, [self.instance(instance_id)])[0]
+
+    @_alone
     def surfaces(self) -> dict[int, Support]:
         """Return all points that are known of each present instance, by id, and under 0 those of no instance, from the
         pictures that are kept; world coordinates. The most that there is to look at.

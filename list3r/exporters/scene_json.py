@@ -18,6 +18,7 @@ from list3r.memory.library.labels import label_source
 from list3r.memory.library.rooms.naming import named_rooms
 from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
+from list3r.queries.views.footprint import large_footprints
 
 FORMAT = "list3r-scene-graph"
 VERSION = 1
@@ -52,6 +53,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
     instances = sorted((i for c in components for i in c.instances), key=lambda i: i.id)
     known = {i.id for i in instances}
     detected = store.detected_labels.all()
+    outlines = {} if gravity == "unknown" else large_footprints(store, instances)
     relations = [r for r in store.relations.all() if r.subject in known and r.object in known]
     return {
         "format": FORMAT,
@@ -70,6 +72,7 @@ def scene_dict(store: Store) -> dict[str, Any]:
             {
                 **instance_entry(i, decimals, store.tracks.of(i.id) if i.dynamic else None),
                 **label_source(i, detected.get(i.id)),
+                "footprint": [_vector(c, decimals) for c in outlines[i.id]] if i.id in outlines else None,
             }
             for i in instances
         ],

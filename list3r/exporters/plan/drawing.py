@@ -33,6 +33,7 @@ from list3r.memory.library.rooms.naming import named_rooms
 from list3r.memory.library.world.gravity import gravity_of
 from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
+from list3r.queries.views.footprint import large_footprints
 
 _INK, _GREY, _LINE = "#262a34", "#787c86", "#cdcfd4"
 _ROOM = "#2f5fa8"
@@ -100,7 +101,7 @@ def plan_figure(store: Store, component: Component, settings: PlanSettings | Non
     draw_grid(ax, view, str(lengths_of(store)))
     if component.id == min((c.component for c in store.chunks.all()), default=0):
         _draw_rooms(ax, view, store)
-    _draw_boxes(ax, view, instances, {i.id for i in tagged})
+    _draw_footprints(ax, view, instances, {i.id for i in tagged}, store)
     _draw_tracks(ax, view, store, component)
     _draw_loops(ax, view, loop_ends(store, component))
     _draw_camera_path(ax, view, component)
@@ -206,19 +207,28 @@ def _draw_rooms(ax: Axes, view: PlanView, store: Store) -> None:
         ax.plot(*view.on_page(d.position), "D", color=_ROOM, ms=5, mfc="white", zorder=4)
 
 
-def _draw_boxes(ax: Axes, view: PlanView, instances: list[Instance], tagged: set[int]) -> None:
-    """Draw oriented boxes, the small ones over the large ones; faint outlines for those without a tag."""
+def _draw_footprints(ax: Axes, view: PlanView, instances: list[Instance], tagged: set[int], store: Store) -> None:
+    """Draw what large things cover and the boxes of others, small ones over large ones; faint where without a tag."""
     if not instances:
         return
     outlines = footprints(view, instances)
     order = np.argsort(-np.ptp(outlines, axis=1).prod(axis=1), kind="stable")
     known = [instances[k].id in tagged for k in order]
+    covered = large_footprints(store, instances) if view.shows_world_axes else {}
+    tops = {i.id: float(i.aabb[1, 2]) for i in instances}
+    shapes = {n: view.on_page(np.column_stack([xy, np.full(len(xy), tops[n])])) for n, xy in covered.items()}
     ids = [instances[k].id for k in order]
     edges = [_color(n, 1.0 if has else 0.4) for n, has in zip(ids, known, strict=True)]
     fills = [_color(n, 0.12 if has else 0.0) for n, has in zip(ids, known, strict=True)]
     widths = [1.6 if has else 0.7 for has in known]
     ax.add_collection(
-        PolyCollection(list(outlines[order]), facecolors=fills, edgecolors=edges, linewidths=widths, zorder=3)
+        PolyCollection(
+            [shapes.get(instances[k].id, outlines[k]) for k in order],
+            facecolors=fills,
+            edgecolors=edges,
+            linewidths=widths,
+            zorder=3,
+        )
     )
 
 
