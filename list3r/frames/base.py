@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,31 +159,44 @@ class BadFrame:
     reason: str
 
 
-class FrameSource(Protocol):
+class LazyFrame(Frame):
+    """A frame whose colour and depth are read when one of them is first asked for: of a slow video most never are.
+
+    One that then cannot be decoded is black and has no depth.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        time_s: float,
+        T_source_cam: NDArray[np.float64] | None,
+        read: Callable[[], Frame | BadFrame],
+    ) -> None:
+        self.__dict__.update(index=index, time_s=time_s, T_source_cam=T_source_cam, _read=read)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("color", "depth"):
+            raise AttributeError(name)
+        frame = self.__dict__["_read"]()
+        if isinstance(frame, BadFrame):
+            frame = Frame(self.index, self.time_s, np.zeros((1, 1, 3), np.uint8), None, None)
+        self.__dict__.update(color=frame.color, depth=frame.depth)
+        return self.__dict__[name]
+
+    def let_go(self) -> None:
+        """Forget the picture, which is read again where it is asked for again."""
+        for name in ("color", "depth"):
+            self.__dict__.pop(name, None)
+
+
+class FrameSource(ABC):
     """Frames by position. A source can be opened again in another process by `open_source` with the same options."""
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised. Cheap: nothing is decoded beyond a first frame."""
-        ...
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        ...
-
-    def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
-        ...
-
-
-class Reader(ABC):
-    """What the readers of recordings share: a `FrameSource` that can also read every N-th frame."""
 
     _info: SourceInfo
 
     @property
     def info(self) -> SourceInfo:
-        """What was recognised."""
+        """What was recognised. Cheap: nothing is decoded beyond a first frame."""
         return self._info
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
@@ -196,6 +210,41 @@ class Reader(ABC):
     @abstractmethod
     def position(self, index: int) -> int:
         """Return where a frame (Frame.index) is among those handed out."""
+
+    def read_some(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but the pictures of frames at positions that are no multiple of `step` are read when looked at."""
+        for position, frame in enumerate(self.read(start, stop), start):
+            if position % step and isinstance(frame, Frame):
+                again = partial(lambda at: next(iter(self.read(at, at + 1))), position)
+                frame = LazyFrame(frame.index, frame.time_s, frame.T_source_cam, again)
+            yield frame
+
+    def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
+        """Frame.index, seconds and pose of the colour camera of every frame that has one; no picture is decoded."""
+        return []
+
+    def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
+        """Grey pictures at positions [start, stop), large enough for local features; None for one that is damaged."""
+        import cv2
+
+        for frame in self.read(start, stop):
+            gray = None if isinstance(frame, BadFrame) else cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+            yield None if gray is None else np.asarray(gray, np.uint8)
+
+    def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
+        """Small grey pictures of all frames in order, in one pass; None for one that is damaged."""
+        return self.read_grays(0, self.info.frame_count)
+
+    def look(self, spots: int) -> Iterator[tuple[int, str]]:
+        """Frame.index of frames at so many places and why each cannot be used, empty where it can.
+
+        The steps between the places are not even, which misses no pattern.
+        """
+        count = self.info.frame_count
+        places = np.linspace(0, 1, min(spots, count)) ** (1.0 if count < spots else 1.1)
+        for position in np.unique((places * (count - 1)).round().astype(int)).tolist():
+            for frame in self.read(position, position + 1):
+                yield frame.index, frame.reason if isinstance(frame, BadFrame) else ""
 
 
 def index_at(source: FrameSource, position: int) -> int:

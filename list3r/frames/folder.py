@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, LazyFrame, SourceInfo, missing_parts
 from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import (
     clean_depth,
@@ -30,7 +30,6 @@ from list3r.frames.decoding.decode import (
 )
 from list3r.frames.decoding.exif import exif_focal, stated_size
 from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
-from list3r.frames.deferred import LazyFrame
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
@@ -56,7 +55,7 @@ NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `conf
 NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not used"
 
 
-class FolderSource(Reader):
+class FolderSource(FrameSource):
     """A `FrameSource` over files; nothing is kept between frames."""
 
     def __init__(self, root: Path, layout: FolderLayout, options: SourceOptions) -> None:
@@ -133,11 +132,15 @@ class FolderSource(Reader):
         raw = read_raw_depth(file.depth)
         return self._color(file), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
-    def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
-        """Return the colour image in grey as stored, each side reduced by 1, 2, 4 or 8.
+    def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
+        """Grey pictures of all frames as stored, each side reduced by 8; None for one that is damaged."""
+        return map(partial(self._gray, reduction=8), range(len(self._chosen)))
 
-        None where it cannot be decoded.
-        """
+    def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
+        """Grey pictures at positions [start, stop) as stored, None for one that is damaged."""
+        return map(self._gray, range(len(self._chosen))[start:stop])
+
+    def _gray(self, position: int, reduction: int = 1) -> NDArray[np.uint8] | None:
         try:
             return read_gray(self._layout.files[self._number(position)].color, reduction)
         except FrameError:

@@ -14,7 +14,7 @@ from list3r.frames.live.addresses import DEVICES, is_phone, without_secrets
 from list3r.frames.live.camera import LiveCamera, LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.record3d import Record3dPhone
-from list3r.frames.writers.pictures import jpeg
+from list3r.frames.writers.base import jpeg
 from list3r.memory.core.errors import OptionError, SourceError
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, missing_parts
 from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
@@ -52,7 +52,7 @@ def _video(root: Path) -> Path | None:
     return (usual or found)[0] if usual or len(found) == 1 else None
 
 
-class AriaSource(Reader):
+class AriaSource(FrameSource):
     """A `FrameSource` over one recording; nothing but its clock and its poses is kept."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:

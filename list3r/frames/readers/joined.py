@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader
+from list3r.frames.base import BadFrame, Frame, FrameSource
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.memory.core.errors import OptionError, SourceError
 
 
-class JoinedVideos(Reader):
+class JoinedVideos(FrameSource):
     """A `FrameSource` over files in the order given; frames are numbered and timed as if they were one file."""
 
     def __init__(self, paths: Sequence[Path], options: SourceOptions) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, missing_parts
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -36,7 +36,7 @@ def is_dataset(root: Path) -> bool:
     return (root / INFO).is_file() and ((root / "data").is_dir() or (root / "videos").is_dir())
 
 
-class LeRobotSource(Reader):
+class LeRobotSource(FrameSource):
     """A `FrameSource`: the pictures of one camera in one episode, numbered from 0, with depth where a key has it."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Listing, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, Listing, SourceInfo, missing_parts
 from list3r.frames.beside import role_of
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
@@ -81,7 +81,7 @@ class Stream:
     """The first message."""
 
 
-class BagSource(Reader):
+class BagSource(FrameSource):
     """A `FrameSource` over one recording; nothing but its index is kept."""
 
     def __init__(self, path: Path, options: SourceOptions, listing: Listing | None = None) -> None:

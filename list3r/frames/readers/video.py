@@ -12,7 +12,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, missing_parts
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
 from list3r.frames.decoding.shown import LOOKED_AT, check_no_panorama, shown_note, shown_part
@@ -32,7 +32,7 @@ _EARLIER = 4
 """Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
 
-class VideoSource(Reader):
+class VideoSource(FrameSource):
     """A `FrameSource` over one video stream. Every `read` opens the file again and seeks to its first frame."""
 
     def __init__(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo, missing_parts
 from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
@@ -49,7 +49,7 @@ class RecordingParts:
     """Frames' own cameras, of the pictures as stored, where they differ from `intrinsics`."""
 
 
-class VideoWithDepth(Reader):
+class VideoWithDepth(FrameSource):
     """A `FrameSource`: the pictures of the video, each with depth and pose of its number."""
 
     def __init__(self, root: Path, parts: RecordingParts, options: SourceOptions) -> None:

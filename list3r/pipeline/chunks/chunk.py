@@ -19,7 +19,6 @@ from list3r.association.overlap.motion import flag_dynamic
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunking.borrowing import Borrowed, Repeat, borrow, frames_around
 from list3r.frames.chunking.chunks import ChunkSpan
-from list3r.frames.deferred import read_some
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
@@ -96,7 +95,7 @@ def _read(task: ChunkTask, source: FrameSource) -> list[Frame | BadFrame]:
     """
     start, stop = task.span.start, task.span.stop
     if task.depth_every > 1 and entry(task.settings.reconstruction).skips:
-        some = list(read_some(source, start, stop, task.depth_every))
+        some = list(source.read_some(start, stop, task.depth_every))
         if not any(isinstance(frame, BadFrame) for frame in some):
             return some
     return list(source.read(start, stop))
