@@ -59,7 +59,6 @@ class PostgresBackend:
     # ------------------------------------------------------------------ writing
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of the one with its name, in one transaction."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
             names, marks = ", ".join(f.name for f in _ENTRY_FIELDS), ", ".join("%s" for _ in _ENTRY_FIELDS)
@@ -106,7 +105,6 @@ class PostgresBackend:
         return out
 
     def drop(self, name: str) -> bool:
-        """Forget a memory; whether there was one."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             known = _first(connection.execute("DELETE FROM memory WHERE name = %s RETURNING memory_id", (name,)))
             if known:
@@ -140,14 +138,12 @@ class PostgresBackend:
     # ------------------------------------------------------------------ asking
 
     def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
-        """Return entries by name."""
         where, values = ("", ()) if names is None else (" WHERE m.name = ANY(?)", (list(names),))
         rows = self._rows(f"SELECT m.memory_id, {_ENTRY} FROM memory m{where} ORDER BY m.name", values)
         self._numbers |= {str(name): int(number) for number, name, *_ in rows}
         return [MemoryEntry(*row[1:]) for row in rows]
 
     def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
-        """Return one instance."""
         query = f"SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ? AND i.id = ?"
         rows = self._rows(query, (self._number(memory), instance_id))
         return _instance((memory, *rows[0])) if rows else None
@@ -155,14 +151,12 @@ class PostgresBackend:
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and the k nearest by axis-aligned boxes, through the index of boxes."""
         passing, values = filters_sql(filters, "i")
         return self._placed(memory, f"{passing} ORDER BY i.bounds <-> ?::cube LIMIT ?", [*values, _corner(point), k])
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and its instances whose axis-aligned boxes meet a box."""
         passing, values = filters_sql(filters, "i")
         region = f"{_corner(lower)},{_corner(upper)}"
         given = [region, *values, None if limit < 0 else limit]
@@ -191,7 +185,6 @@ class PostgresBackend:
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
     ) -> tuple[list[tuple[CatalogInstance, float]], int]:
-        """Return the k that are wanted with how well the words name them."""
         a, values = wanted_sql(wanted, "i", _bearing, joined=memory is None)
         b, more = filters_sql(filters, "i")
         only, given = ("", ()) if memory is None else (" AND i.memory_id = ?", (self._number(memory),))
@@ -208,7 +201,6 @@ class PostgresBackend:
     def related(
         self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
     ) -> list[tuple[str, int, str, str, int, str, float, float]]:
-        """Return relations, the surest first."""
         (a, values), (b, more) = wanted_sql(subject, "s", _bearing), wanted_sql(object, "o", _bearing)
         parts, given = [a, b], [*values, *more]
         if memory is not None:
@@ -228,7 +220,6 @@ class PostgresBackend:
         return self._rows(query, (*given, k))
 
     def spaces(self, memory: str | None) -> list[str]:
-        """Return the names of spaces that hold vectors. Raises `CatalogError` where the server has no pgvector."""
         self._need_vectors()
         known = self._rows("SELECT name, space_id FROM space ORDER BY name", ())
         if memory is None:
@@ -237,7 +228,6 @@ class PostgresBackend:
         return [str(name) for name, n in known if self._rows(query.format(int(n)), (number,))[0][0]]
 
     def dimension(self, space: str) -> int | None:
-        """Return how many numbers the vectors of a space have. Raises `CatalogError` where there is no pgvector."""
         self._need_vectors()
         rows = self._rows("SELECT dimension FROM space WHERE name = ?", (space,))
         return int(rows[0][0]) if rows else None
@@ -249,7 +239,6 @@ class PostgresBackend:
             )
 
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
-        """Return the vector of an instance."""
         query = f"SELECT v::real[] FROM vector_{self._space(space)} WHERE memory_id = ? AND id = ?"
         rows = self._rows(query, (self._number(memory), instance_id))
         return np.array(rows[0][0], np.float32) if rows else None
@@ -304,7 +293,6 @@ class PostgresBackend:
         return int(rows[0][0])
 
     def alive(self) -> bool:
-        """Whether the database answers."""
         try:
             self._rows("SELECT 1", ())
         except CatalogError:
@@ -312,7 +300,6 @@ class PostgresBackend:
         return True
 
     def close(self) -> None:
-        """Let the connections go."""
         self._connections.close()
 
     def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:

@@ -84,7 +84,6 @@ class SqliteBackend:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of the one with its name."""
         with self._writing():
             known = self.memories([content.entry.name])
             before = known[0] if known else content.entry
@@ -125,11 +124,9 @@ class SqliteBackend:
 
     @contextlib.contextmanager
     def loading(self, *, many: bool) -> Iterator[None]:
-        """Write memories: nothing is to be made again here."""
         yield
 
     def drop(self, name: str) -> bool:
-        """Forget a memory; whether there was one."""
         with self._writing():
             known = bool(self.memories([name]))
             if known:
@@ -145,7 +142,6 @@ class SqliteBackend:
             self._database.execute(f"DELETE FROM {table} WHERE memory_id = ?", (memory,))
 
     def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
-        """Return entries by name."""
         if names is None:
             rows = self._rows(f"SELECT {_ENTRY} FROM memory m ORDER BY m.name", ())
         else:
@@ -157,14 +153,12 @@ class SqliteBackend:
         return [MemoryEntry(*row) for row in rows]
 
     def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
-        """Return one instance."""
         rows = self._rows(f"SELECT {_INSTANCE} {_FROM} WHERE {_OF_MEMORY} AND i.id = ?", (memory, instance_id))
         return _instance(rows[0]) if rows else None
 
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and the k nearest by axis-aligned boxes."""
         entry = self.memories([memory])
         return (entry[0], self._near(memory, np.asarray(point, np.float64), k, filters)) if entry else None
 
@@ -195,7 +189,6 @@ class SqliteBackend:
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and its instances whose axis-aligned boxes meet a box."""
         entry = self.memories([memory])
         return (entry[0], self._inside(memory, lower, upper, filters, limit)) if entry else None
 
@@ -218,7 +211,6 @@ class SqliteBackend:
     def named(
         self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
     ) -> tuple[list[tuple[CatalogInstance, float]], int]:
-        """Return the k that are wanted with how well the words name them."""
         where, values = _where(memory, wanted, filters)
         marks = ", ".join("?" for _ in wanted.words)
         weight = (
@@ -236,7 +228,6 @@ class SqliteBackend:
     def related(
         self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
     ) -> list[tuple[str, int, str, str, int, str, float, float]]:
-        """Return relations, the surest first."""
         bearing = _bearing if memory is None else _bearing_here
         (a, values), (b, more) = wanted_sql(subject, "s", bearing), wanted_sql(object, "o", bearing)
         parts, given = [a, b], [*values, *more]
@@ -256,17 +247,14 @@ class SqliteBackend:
         return [tuple(row) for row in self._rows(query, (*given, k))]
 
     def spaces(self, memory: str | None) -> list[str]:
-        """Return the names of spaces that hold vectors."""
         where, values = ("", ()) if memory is None else (f"WHERE {_OF_MEMORY.replace('i.', '')}", (memory,))
         return [str(s) for (s,) in self._rows(f"SELECT DISTINCT space FROM vector {where} ORDER BY space", values)]
 
     def dimension(self, space: str) -> int | None:
-        """Return how many numbers the vectors of a space have."""
         rows = self._rows("SELECT length(v) FROM vector WHERE space = ? LIMIT 1", (space,))
         return int(rows[0][0]) // 2 if rows else None
 
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
-        """Return the vector of an instance."""
         query = f"SELECT v FROM vector i WHERE space = ? AND {_OF_MEMORY} AND id = ?"
         rows = self._rows(query, (space, memory, instance_id))
         return np.frombuffer(rows[0][0], "<f2").astype(np.float32) if rows else None
@@ -274,7 +262,6 @@ class SqliteBackend:
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogInstance, float]]:
-        """Return the k most alike: all vectors are compared, so the answer is exact."""
         passing, values = filters_sql(filters, "i")
         only, given = ("", ()) if memory is None else (f" AND {_OF_MEMORY}", (memory,))
         query = (
@@ -293,7 +280,6 @@ class SqliteBackend:
             return [(_instance(self._database.execute(query, (int(n),)).fetchone()), float(c)) for c, n in best]
 
     def alive(self) -> bool:
-        """Whether the file can be read."""
         try:
             self._rows("SELECT 1 FROM memory LIMIT 1", ())
         except CatalogError:
@@ -301,7 +287,6 @@ class SqliteBackend:
         return True
 
     def close(self) -> None:
-        """Close the file."""
         self._database.close()
 
     def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:

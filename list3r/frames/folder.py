@@ -87,7 +87,6 @@ class FolderSource(FrameSource):
         self._info = self._describe(root, notes)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
         for position in range(len(self._chosen))[start:stop:step]:
             yield self._read(self._number(position))
 
@@ -112,11 +111,9 @@ class FolderSource(FrameSource):
             return BadFrame(number, str(error))
 
     def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of the colour camera of every frame that has one; no picture is decoded."""
         found = [(k, self._layout.files[k]) for k in map(self._number, range(len(self._chosen)))]
         poses = [(k, self._time_s(k, file), self._pose(file)) for k, file in found]
         return [(k, time_s, T) for k, time_s, T in poses if T is not None]
@@ -133,11 +130,9 @@ class FolderSource(FrameSource):
         return self._color(file), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures of all frames as stored, each side reduced by 8; None for one that is damaged."""
         return map(partial(self._gray, reduction=8), range(len(self._chosen)))
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures at positions [start, stop) as stored, None for one that is damaged."""
         return map(self._gray, range(len(self._chosen))[start:stop])
 
     def _gray(self, position: int, reduction: int = 1) -> NDArray[np.uint8] | None:

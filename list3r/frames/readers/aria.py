@@ -87,7 +87,6 @@ class AriaSource(FrameSource):
         self._info = self._describe(root, tuple(notes), moved)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
         color = _opened(self._path, COLOR)
         depth = None if self._depth_path is None else _opened(self._depth_path, DEPTH)
         for k in range(len(self._chosen))[start:stop:step]:
@@ -98,11 +97,9 @@ class AriaSource(FrameSource):
                 yield BadFrame(number, str(error))
 
     def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
         numbers = [int(n) for n in self._chosen.starts]
         return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
 

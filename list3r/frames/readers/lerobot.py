@@ -69,7 +69,6 @@ class LeRobotSource(FrameSource):
         self._info = self._describe(root, options, episode, tuple(notes))
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         depths: Iterator[tuple[int, NDArray[np.float32] | None]] | None = None
         for frame in self._video.read_every(start, stop, step):
             number = frame.index - self._first
@@ -86,15 +85,12 @@ class LeRobotSource(FrameSource):
             yield self._with_depth(frame, raw)
 
     def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
         return self._video.position(index + self._first)
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
-        """Small grey pictures of all frames handed out, None for one that is damaged."""
         return self._video.thumbnails()
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures at positions [start, stop), None for one that is damaged."""
         return self._video.read_grays(start, stop)
 
     def _with_depth(self, frame: Frame, raw: NDArray[np.float32] | None) -> Frame | BadFrame:

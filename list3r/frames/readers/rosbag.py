@@ -127,7 +127,6 @@ class BagSource(FrameSource):
         self._info = replace(self._describe(tuple(notes), posed > 0), poses_drift=world == DRIFTING)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         numbers = [int(self._chosen.starts[k]) for k in range(len(self._chosen))[start:stop:step]]
         if not numbers:
             return
@@ -157,11 +156,9 @@ class BagSource(FrameSource):
             yield BadFrame(number, "its messages are missing from the recording")
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
         numbers = [int(n) for n in self._chosen.starts]
         return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
 

@@ -61,7 +61,6 @@ class VideoSource(FrameSource):
         self._info = self._describe()
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
         for number, image in islice(self.pictures(start, stop), 0, None, step):
             if image is None:
                 yield BadFrame(number, _DAMAGED)
@@ -92,11 +91,9 @@ class VideoSource(FrameSource):
         return self._time_s(number)
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
         return self._chosen.position(index)
 
     def look(self, spots: int) -> Iterator[tuple[int, str]]:
-        """Number of some frames and why each cannot be used, empty where it can: runs behind key frames all over."""
         stamps, count = self._stamps, len(self._chosen)
         keys = np.searchsorted(stamps.stamps, stamps.keys) if not stamps.counted else np.zeros(0, int)
         starts = np.unique([0, *(self._chosen.position(int(k)) for k in keys)])
@@ -107,12 +104,10 @@ class VideoSource(FrameSource):
                 yield number, _DAMAGED if image is None else ""
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
-        """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""
         for _, image in self.pictures(0, len(self._chosen), threads=True):
             yield None if image is None else small_gray(image, _THUMBNAIL_PX)
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures at positions [start, stop), as stored, of at most 640 px; None for one that is damaged."""
         for _, image in self.pictures(start, stop):
             yield None if image is None else small_gray(image, _LOOKED_AT_PX)
 

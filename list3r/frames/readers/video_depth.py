@@ -69,7 +69,6 @@ class VideoWithDepth(FrameSource):
         self._info = self._describe(root, options.kind)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         for frame in self._video.read_every(start, stop, step):
             try:
                 yield frame if isinstance(frame, BadFrame) else self._with_depth(frame)
@@ -77,11 +76,9 @@ class VideoWithDepth(FrameSource):
                 yield BadFrame(frame.index, str(error))
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
         return self._video.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
         numbers = (self._video.number(k) for k in range(self._info.frame_count))
         found = ((k, self._video.time_s(k), self._parts.poses.get(k)) for k in numbers)
         return [(k, time_s, T) for k, time_s, T in found if T is not None]

@@ -328,11 +328,9 @@ class _JointModel:
         self._task = task
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Reconstruct a chunk."""
         return self._made()(frames, camera)
 
     def joint(self, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
-        """Reconstruct all sides in one gauge."""
         return reconstruct_jointly(self._made(), sides)
 
     def _made(self) -> Reconstructor:
