@@ -6,10 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from list3r.frames.selection import FrameSelection
 
 Listing = Callable[[int, int], None]
 """Hears how far a recording is listed: parts looked at, and in all."""
@@ -91,8 +94,6 @@ class SourceInfo:
     """Pinhole camera of the frames handed out, None where the intrinsics are unknown."""
     has_depth: bool
     has_poses: bool
-    scale_kind: str
-    """metric or relative."""
     fingerprint: str
     """Changes when the source or the options that shape its frames change; guards `--resume`."""
     depth_camera: Camera | None = None
@@ -103,8 +104,6 @@ class SourceInfo:
     """Stored depth units per metre."""
     notes: tuple[str, ...] = field(default=())
     """What was assumed, one sentence each."""
-    missing: tuple[str, ...] = field(default=())
-    """What is missing and which option supplies it, one sentence each."""
     image_size: tuple[int, int] | None = None
     """Height and width of the frames handed out, px."""
     stored_size: tuple[int, int] | None = None
@@ -122,18 +121,21 @@ class SourceInfo:
     camera_guess: Camera | None = None
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 
+    @property
+    def scale_kind(self) -> str:
+        """metric or relative."""
+        return "metric" if self.has_depth else "relative"
 
-def missing_parts(*, depth: bool, camera: bool) -> list[str]:
-    """Return what a source lacks of depth and the camera's intrinsics, and what then is done, one sentence each."""
-    out = [] if depth else ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
-    if not camera:
-        done = (
-            "give --intrinsics fx,fy,cx,cy"
-            if depth
-            else "build estimates them; --intrinsics fx,fy,cx,cy is more accurate"
-        )
-        out.append(f"the camera's intrinsics are unknown: {done}")
-    return out
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What is missing, and what then is done, one sentence each."""
+        lacking = "there is no depth: build takes colour alone (--reconstruction sfm or a network)"
+        out = [] if self.has_depth else [lacking]
+        if self.camera is None:
+            option = "--intrinsics fx,fy,cx,cy"
+            done = f"give {option}" if self.has_depth else f"build estimates them; {option} is more accurate"
+            out.append(f"the camera's intrinsics are unknown: {done}")
+        return tuple(out)
 
 
 GUESSED_FOCAL = 1.2
@@ -193,6 +195,8 @@ class FrameSource(ABC):
     """Frames by position. A source can be opened again in another process by `open_source` with the same options."""
 
     _info: SourceInfo
+    _chosen: FrameSelection
+    """The frames handed out; sources that hold others have their `position`."""
 
     @property
     def info(self) -> SourceInfo:
@@ -207,9 +211,9 @@ class FrameSource(ABC):
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""
 
-    @abstractmethod
     def position(self, index: int) -> int:
         """Return where a frame (Frame.index) is among those handed out."""
+        return self._chosen.position(index)
 
     def read_some(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but the pictures of frames at positions that are no multiple of `step` are read when looked at."""

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, LazyFrame, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, LazyFrame, SourceInfo
 from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import (
     clean_depth,
@@ -109,9 +109,6 @@ class FolderSource(FrameSource):
             return self._frame(number)
         except FrameError as error:
             return BadFrame(number, str(error))
-
-    def position(self, index: int) -> int:
-        return self._chosen.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
         found = [(k, self._layout.files[k]) for k in map(self._number, range(len(self._chosen)))]
@@ -387,7 +384,6 @@ class FolderSource(FrameSource):
         found = fingerprint(layout.kind, self._listing(root), self._options)
         notes = (*notes, *self._doubts())
         guess, turns = self._camera_guess(), self._turns()
-        missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
         if rig.shown is not None:
             notes = (*notes, shown_note(rig.shown, rig.stored_size))
         if rig.color_size != rig.shown_size:
@@ -413,13 +409,11 @@ class FolderSource(FrameSource):
             camera=rig.camera,
             has_depth=self._has_depth,
             has_poses=has_poses,
-            scale_kind="metric" if self._has_depth else "relative",
             fingerprint=found,
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
             notes=(*layout.notes, *notes, *not_read_note(left)),
-            missing=tuple(missing),
             image_size=rig.color_size,
             stored_size=rig.shown_size,
             corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),

@@ -160,6 +160,17 @@ def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intri
     return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))
 
 
+def intrinsics_of_matrix(numbers: Sequence[float]) -> Intrinsics:
+    """fx, fy, cx, cy of a camera matrix of 9 or 16 numbers, row by row or column by column. Raises `OptionError`."""
+    side = {9: 3, 16: 4}.get(len(numbers))
+    if side is None:
+        raise OptionError(f"a camera matrix of {len(numbers)} numbers: give 3x3 or 4x4")
+    m = np.array(numbers, np.float64).reshape(side, side)
+    if not m[0, 2] and not m[1, 2]:
+        m = m.T
+    return check_intrinsics([float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2])])
+
+
 _MOST_DISTORTION = 100.0
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo
 from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
@@ -96,9 +96,6 @@ class AriaSource(FrameSource):
             except FrameError as error:
                 yield BadFrame(number, str(error))
 
-    def position(self, index: int) -> int:
-        return self._chosen.position(index)
-
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
         numbers = [int(n) for n in self._chosen.starts]
         return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
@@ -123,11 +120,9 @@ class AriaSource(FrameSource):
             camera=self._view.camera,
             has_depth=has_depth,
             has_poses=any(T is not None for T in self._poses),
-            scale_kind="metric" if has_depth else "relative",
             fingerprint=fingerprint("aria", listing, self._options),
             depth_scale=(self._options.depth_scale or _MILLIMETRES) if has_depth else None,
             notes=notes,
-            missing=tuple(missing_parts(depth=has_depth, camera=True)),
             image_size=(self._view.camera.height, self._view.camera.width),
             z_up=moved is not None and moved.upright,
             poses_drift=moved is not None and moved.drifts,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -110,13 +110,11 @@ class LeRobotSource(FrameSource):
             kind="lerobot",
             path=str(root),
             has_depth=has_depth,
-            scale_kind="metric" if has_depth else "relative",
             fingerprint=hashlib.sha256(print_.encode()).hexdigest()[:32],
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=self._rig.depth_scale if has_depth else None,
             notes=(*info.notes, *notes),
-            missing=tuple(missing_parts(depth=has_depth, camera=info.camera is not None)),
         )
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, FrameSource, Listing, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, Listing, SourceInfo
 from list3r.frames.beside import role_of
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
@@ -155,9 +155,6 @@ class BagSource(FrameSource):
         for number in [] if due is None else [due, *upcoming]:
             yield BadFrame(number, "its messages are missing from the recording")
 
-    def position(self, index: int) -> int:
-        return self._chosen.position(index)
-
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
         numbers = [int(n) for n in self._chosen.starts]
         return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
@@ -191,7 +188,6 @@ class BagSource(FrameSource):
         rig, separate = self._rig, self._rig.registration
         files = [self._path] if self._path.is_file() else sorted(p for p in self._path.iterdir() if p.is_file())
         listing = [(p.name, p.stat().st_size) for p in files]
-        missing = missing_parts(depth=self._depth is not None, camera=rig.camera is not None)
         gaps = np.diff(self._times_s)
         return SourceInfo(
             kind="rosbag",
@@ -201,13 +197,11 @@ class BagSource(FrameSource):
             camera=rig.camera,
             has_depth=self._depth is not None,
             has_poses=has_poses,
-            scale_kind="metric" if self._depth is not None else "relative",
             fingerprint=fingerprint("rosbag", listing, self._options),
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._depth is not None else None,
             notes=notes,
-            missing=tuple(missing),
             image_size=rig.color_size,
         )
 

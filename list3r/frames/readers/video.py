@@ -12,7 +12,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
 from list3r.frames.decoding.shown import LOOKED_AT, check_no_panorama, shown_note, shown_part
@@ -89,9 +89,6 @@ class VideoSource(FrameSource):
     def time_s(self, number: int) -> float:
         """Seconds of a frame."""
         return self._time_s(number)
-
-    def position(self, index: int) -> int:
-        return self._chosen.position(index)
 
     def look(self, spots: int) -> Iterator[tuple[int, str]]:
         stamps, count = self._stamps, len(self._chosen)
@@ -203,7 +200,6 @@ class VideoSource(FrameSource):
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
         if self._chosen.sharpest:
             notes.append("of each group of frames the sharpest is taken; --no-sharpest takes the first")
-        missing = missing_parts(depth=False, camera=rig.camera is not None)
         focal = None if rig.camera is not None else self._stamps.focal_35mm
         height, width = rig.shown_size
         guess = believable(None if focal is None else film_focal(focal, width, height), width, height)
@@ -216,10 +212,8 @@ class VideoSource(FrameSource):
             camera=rig.camera,
             has_depth=False,
             has_poses=False,
-            scale_kind="relative",
             fingerprint=fingerprint("video", listing, self._options),
             notes=tuple(notes),
-            missing=tuple(missing),
             image_size=rig.color_size,
             stored_size=rig.shown_size,
             corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo
 from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
@@ -141,7 +141,6 @@ class VideoWithDepth(FrameSource):
             path=str(root),
             has_depth=bool(parts.depth),
             has_poses=bool(parts.poses),
-            scale_kind="metric" if parts.depth else "relative",
             depth_camera=registration.depth_camera if registration else None,
             T_color_depth=registration.T_color_depth if registration else None,
             depth_scale=self._rig.depth_scale if parts.depth else None,
@@ -153,7 +152,6 @@ class VideoWithDepth(FrameSource):
                 *lying_note(turns or 0),
                 *not_read_note(left),
             ),
-            missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=turns is not None,
             poses_drift=parts.poses_drift,
         )

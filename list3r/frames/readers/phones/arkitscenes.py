@@ -63,7 +63,6 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         "color",
         intrinsics,
         tuple(notes),
-        (),
         LEAST_CONFIDENCE,
         z_up=True,
         upright_tags=False,
