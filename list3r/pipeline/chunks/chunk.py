@@ -376,8 +376,7 @@ def _detector(settings: BuildSettings) -> LearnedDetector | None:
     """The network of the local features, loaded once in a process; None for SIFT."""
     if settings.local_features == "sift":
         return None
-    device = "cpu" if settings.device == "auto" else settings.device
-    return make_detector(settings.local_features, Path(settings.feature_weights or ""), device)
+    return make_detector(settings.local_features, Path(settings.feature_weights or ""), settings.device)
 
 
 @lru_cache(maxsize=2)
