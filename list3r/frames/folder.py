@@ -29,7 +29,7 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal, stated_size
-from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
+from list3r.frames.decoding.shown import LOOKED_AT, ShownPart, check_no_panorama, shown_note, shown_part
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
@@ -217,26 +217,32 @@ class FolderSource(FrameSource):
         reason = ""
         for file in chain(first, others if count < len(files) else ()):
             try:
-                color = read_color(file.color, upright=self._layout.upright_tags)
-                self._first_picture = file.color
-                self._bits = used_bits([f.color for f in paths])
-                if not self._has_depth:
-                    return color.shape[:2], None
-                if file.depth is not None:
-                    raw = read_raw_depth(file.depth)
-                    if raw.dtype == np.uint8:
-                        raise SourceError(
-                            f"{root}: depth images like {file.depth.name} have 8 bits, 255 steps, as pictures of depth "
-                            "for people have; export depth with 16 bits, or use --kind images on the pictures' folder "
-                            "to take colour alone"
-                        )
-                    self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
-                    return color.shape[:2], raw.shape
+                if found := self._sizes(root, file, [f.color for f in paths]):
+                    return found
             except FrameError as error:
                 reason = reason or str(error)
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
 
-    def _shown_part(self, root: Path) -> Shown | None:
+    def _sizes(
+        self, root: Path, file: FrameFile, colors: list[Stored]
+    ) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
+        """Image sizes of a frame, None for one without the depth that others have. Raises `FrameError`."""
+        color = read_color(file.color, upright=self._layout.upright_tags)
+        self._first_picture, self._bits = file.color, used_bits(colors)
+        if not self._has_depth:
+            return color.shape[:2], None
+        if file.depth is None:
+            return None
+        raw = read_raw_depth(file.depth)
+        if raw.dtype == np.uint8:
+            raise SourceError(
+                f"{root}: depth images like {file.depth.name} have 8 bits, 255 steps, as pictures of depth for people "
+                "have; export depth with 16 bits, or use --kind images on the pictures' folder to take colour alone"
+            )
+        self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
+        return color.shape[:2], (raw.shape[0], raw.shape[1])
+
+    def _shown_part(self, root: Path) -> ShownPart | None:
         """Return the part of pictures without depth that is no black bar. Raises `SourceError` for panoramas."""
         files, chosen = self._layout.files, self._chosen
         if (

@@ -228,19 +228,19 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
     if words is None and _names_a_file(text):
         raise OptionError(f"{name} {text!r}: there is no such file, and it is not a row of numbers such as tx,ty,tz")
     v = np.array(parse_numbers(words or text, name))
-    matrix = np.eye(4)
-    if len(v) in (12, 16):
-        matrix[: len(v) // 4] = v.reshape(-1, 4)
-    elif len(v) in (3, 7):
-        matrix[:3, 3] = v[:3]
-        if len(v) == 7:
-            xyzw = v[3:] if quaternion == "xyzw" else np.roll(v[3:], -1)
-            if not abs(np.linalg.norm(xyzw) - 1.0) < 0.01:
-                raise OptionError(f"{name} {text!r}: the last four numbers must be a unit quaternion {quaternion}")
-            matrix[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
-    else:
+    if len(v) not in (3, 7, 12, 16):
         order = ",".join("q" + letter for letter in quaternion)
         raise OptionError(f"{name} {text!r}: give 16 numbers (4x4) or tx,ty,tz,{order}, not {len(v)}")
+    matrix = np.eye(4)
+    if len(v) >= 12:
+        matrix[: len(v) // 4] = v.reshape(-1, 4)
+    else:
+        matrix[:3, 3] = v[:3]
+    if len(v) == 7:
+        xyzw = v[3:] if quaternion == "xyzw" else np.roll(v[3:], -1)
+        if not abs(np.linalg.norm(xyzw) - 1.0) < 0.01:
+            raise OptionError(f"{name} {text!r}: the last four numbers must be a unit quaternion {quaternion}")
+        matrix[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
     return tuple(tuple(float(x) for x in row) for row in check_rigid(matrix, name))
 
 
