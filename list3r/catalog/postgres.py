@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.catalog.base import INSTANCE, OF_ONE, Backend, Condition, check_dimension, filters_sql, wanted_sql
 from list3r.catalog.postgres_connections import Connections
-from list3r.catalog.postgres_schema import MIGRATIONS, lists_of, vector_index, vector_table
+from list3r.catalog.postgres_schema import SCHEMA, SCHEMA_VERSION, lists_of, vector_index, vector_table
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
@@ -51,7 +51,7 @@ class PostgresBackend(Backend):
         self._connections = Connections(url, connections)
         self._numbers: dict[str, int] = {}
         with self._connected("opened") as connection, connection.transaction():
-            self.has_vectors = _migrated(connection)
+            self.has_vectors = _made(connection)
 
     # ------------------------------------------------------------------ writing
 
@@ -320,26 +320,24 @@ def _first_line(error: Exception) -> str:
     return str(text).splitlines()[0]
 
 
-def _migrated(connection: psycopg.Connection[Any]) -> bool:
-    """Bring the schema up to date; return whether the database has vectors. Raises `CatalogError`."""
-    known = _first(connection.execute("SELECT to_regclass('list3r.version')"))[0]
-    done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0) if known else 0
-    if done > len(MIGRATIONS):
-        raise CatalogError(
-            f"the catalogue has schema {done} of a newer list3r; this one knows up to {len(MIGRATIONS)}; update list3r"
-        )
-    if done < len(MIGRATIONS):
+def _made(connection: psycopg.Connection[Any]) -> bool:
+    """Make the schema where there is none; return whether the database has vectors. Raises `CatalogError`."""
+    if not _first(connection.execute("SELECT to_regclass('list3r.version')"))[0]:
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_SCHEMA_LOCK,))
         connection.execute("CREATE SCHEMA IF NOT EXISTS list3r")
         connection.execute("CREATE TABLE IF NOT EXISTS version (number integer PRIMARY KEY)")
-        done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0)
         for name in ("cube", "btree_gist"):
             connection.execute(f"CREATE EXTENSION IF NOT EXISTS {name} SCHEMA public")
         if connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'vector'").fetchone():
             connection.execute("CREATE EXTENSION IF NOT EXISTS vector SCHEMA public")
-        for number, statements in enumerate(MIGRATIONS[done:], done + 1):
-            connection.execute(statements.encode())
-            connection.execute("INSERT INTO version VALUES (%s)", (number,))
+        if not connection.execute("SELECT 1 FROM version").fetchone():  # nobody made it meanwhile
+            connection.execute(SCHEMA.encode())
+            connection.execute("INSERT INTO version VALUES (%s)", (SCHEMA_VERSION,))
+    held = _first(connection.execute("SELECT max(number) FROM version"))[0]
+    if held != SCHEMA_VERSION:
+        raise CatalogError(
+            f"the catalogue has schema {held}, this list3r {SCHEMA_VERSION}: use the list3r that made it"
+        )
     return connection.execute("SELECT 1 FROM pg_extension WHERE extname = 'vector'").fetchone() is not None
 
 

@@ -181,10 +181,7 @@ class FolderSource(FrameSource):
         least = self._layout.least_confidence
         if least is None or file.confidence is None:
             return raw
-        confidence = read_raw_depth(file.confidence)
-        if confidence.shape != raw.shape:
-            confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        return sure_depth(raw, confidence, least)
+        return sure_depth(raw, read_raw_depth(file.confidence), least)
 
     def _time_s(self, number: int, file: FrameFile) -> float:
         return file.time_s if self._clock and file.time_s is not None else number / self._fps

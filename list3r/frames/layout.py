@@ -107,6 +107,11 @@ def usual_camera(cameras: Sequence[Camera]) -> Camera:
     return Camera(width, height, *np.median(np.array(same), axis=0).tolist())
 
 
+def there(path: Path) -> Path | None:
+    """Return the path of a file that is there, else None."""
+    return path if path.is_file() else None
+
+
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key under which `frame2` comes before `frame10`."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.lower()) if part]

@@ -84,6 +84,8 @@ def read_raw_depth(path: Stored | CodedArray) -> NDArray[Any]:
 
 def sure_depth(raw: NDArray[Any], confidence: NDArray[Any], least: int) -> NDArray[Any]:
     """Return depth as stored, 0 where ARKit was less sure than `least` (0, 1, 2; some apps store 0, 127, 255)."""
+    if confidence.shape != raw.shape:
+        confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     levels = confidence if confidence.max(initial=0) <= 2 else np.rint(confidence / 127.5)
     return np.where(levels >= least, raw, np.zeros((), raw.dtype))
 

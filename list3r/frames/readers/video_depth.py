@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,10 +99,7 @@ class VideoWithDepth(FrameSource):
         path = None if self._parts.confidence is None else self._parts.confidence(number)
         if path is None or not path.is_file():
             return raw
-        confidence = read_raw_depth(path)
-        if confidence.shape != raw.shape:
-            confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        return sure_depth(raw, confidence, self._parts.least_confidence)
+        return sure_depth(raw, read_raw_depth(path), self._parts.least_confidence)
 
     def _doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with depth, of some frames spread over the recording."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.beside import listed
-from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read_json, varies_note
+from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read_json, there, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics, intrinsics_of_matrix
 from list3r.frames.recordings.axes import pose_of_arkit
@@ -36,10 +36,10 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(
         FrameFile(
             p,
-            _there(root, f"depth_{p.stem[6:]}.png"),
+            there(root / f"depth_{p.stem[6:]}.png"),
             T_source_camera=stated[p][1] if p in stated else None,
             time_s=stated[p][2] if p in stated else None,
-            confidence=_there(root, f"conf_{p.stem[6:]}.png"),
+            confidence=there(root / f"conf_{p.stem[6:]}.png"),
         )
         for p in colors
     )
@@ -59,11 +59,6 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         read=("info.json", *(path.name for path in tables.values())),
         upright_tags=False,
     )
-
-
-def _there(root: Path, name: str) -> Path | None:
-    path = root / name
-    return path if path.is_file() else None
 
 
 def _table(path: Path) -> tuple[list[float], Any, float | None]:
