@@ -29,7 +29,7 @@ from typing import Any
 from machine import machine, write_json
 
 import list3r
-from list3r.frames.writers.pictures import jpeg
+from list3r.frames.writers.base import jpeg
 from list3r.memory.core.errors import List3rError
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import Renderer

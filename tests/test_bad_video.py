@@ -71,7 +71,7 @@ class Steps:
 
     def __init__(self, steps: list[int]) -> None:
         self.steps = steps
-        self.info = SourceInfo("images", "here", len(steps), 30.0, None, False, False, "relative", "")
+        self.info = SourceInfo("images", "here", len(steps), 30.0, None, False, False, "")
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         for n in range(len(self.steps))[start:stop]:

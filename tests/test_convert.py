@@ -11,7 +11,7 @@ from list3r.frames.convert import LAYOUTS, convert
 from list3r.frames.decoding.decode import read_raw_depth
 from list3r.frames.options import SourceOptions
 from list3r.frames.source import open_source
-from list3r.frames.writers.pictures import png16
+from list3r.frames.writers.base import png16
 from list3r.memory.core.errors import ExportError, OptionError, SourceError
 from tests.recordings import COUNT, off_plane, put, shots, write_colmap, write_nerfstudio, write_record3d
 from tests.test_frames_recordings import frames_of, world_points

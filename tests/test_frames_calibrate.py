@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from list3r.frames.base import Camera, Frame, Reader, SourceInfo
+from list3r.frames.base import Camera, Frame, FrameSource, SourceInfo
 from list3r.frames.inspection import SourceReport
 from list3r.frames.registration.calibrate import DepthCalibrationSettings, calibrate
 from list3r.frames.registration.edge_look import depth_doubts
@@ -105,12 +105,12 @@ def test_depth_edges_are_the_near_side_even_across_a_shadow() -> None:
     assert set(edges.x[edges.horizontal].tolist()) == {20, 39}
 
 
-class Apart(Reader):
+class Apart(FrameSource):
     """A walk whose depth is that of other frames, or turned."""
 
     def __init__(self, lag: int, turn: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> None:
         self._frames, self._lag, self._turn = sound_walk(), lag, turn
-        self._info = SourceInfo("video", "walk", len(self._frames), 30.0, CAMERA, True, False, "metric", "")
+        self._info = SourceInfo("video", "walk", len(self._frames), 30.0, CAMERA, True, False, "")
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame]:
         for k in range(len(self._frames))[start:stop:step]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from list3r.frames.base import BadFrame, Frame, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
 from list3r.frames.decoding.decode import sure_depth
 from list3r.frames.inspection import SourceReport
 from list3r.frames.options import SourceOptions
@@ -407,6 +407,9 @@ def test_what_build_makes_of_a_source_is_said(
 
 
 def test_what_is_needed_is_told_from_what_would_help() -> None:
-    assert missing_parts(depth=True, camera=True) == []
-    assert "give --intrinsics" in missing_parts(depth=True, camera=False)[0]
-    assert "build estimates them" in missing_parts(depth=False, camera=False)[1]
+    def missing(depth: bool, camera: Camera | None) -> tuple[str, ...]:
+        return SourceInfo("tum", "walk", 9, 30.0, camera, depth, False, "").missing
+
+    assert missing(True, Camera(64, 48, 60.0, 60.0, 31.5, 23.5)) == ()
+    assert "give --intrinsics" in missing(True, None)[0]
+    assert "build estimates them" in missing(False, None)[1]

@@ -161,7 +161,7 @@ def test_it_is_asked_for_by_name() -> None:
 def test_it_is_the_default_and_damage_to_its_weights_is_said(
     which: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
+    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "x")
     assert settings_asked(BuildRequest(), depth, "any")[0].discovery == "learned"
     assert settings_asked(BuildRequest(), replace(depth, has_depth=False), "any")[0].discovery == "learned"
     assert settings_asked(BuildRequest(discovery="eomt"), depth, "any")[0].discovery == "eomt"
@@ -175,7 +175,7 @@ def test_it_is_the_default_and_damage_to_its_weights_is_said(
 
 
 def test_a_session_of_a_discoverer_that_is_gone_says_how_to_go_on() -> None:
-    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "metric", "x")
+    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "x")
     begun = BuildSettings(discovery="geometric")
     with pytest.raises(OptionError, match="continue with --discovery learned"):
         settings_resumed(BuildRequest(), begun, depth, "any")

@@ -21,7 +21,7 @@ from list3r.frames.live.feed import FeedState, LiveSettings
 from list3r.frames.live.spooled import StreamFeed
 from list3r.frames.live.stream import NetworkStream
 from list3r.frames.source import open_source
-from list3r.frames.writers.pictures import jpeg
+from list3r.frames.writers.base import jpeg
 from list3r.memory.core.errors import OptionError, SourceError
 from list3r.memory.store.store import Store
 from list3r.pipeline.live import build_live, ready_spans

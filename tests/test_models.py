@@ -25,7 +25,6 @@ from list3r.models.cache import (
     fetch,
     find_cached,
     locate,
-    read_header,
     resolve,
     split_name,
 )
@@ -278,17 +277,11 @@ def test_a_repository_without_weights_says_so(hub: type[_Hub]) -> None:
 def test_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
     good = tmp_path / "model.safetensors"
     save_file({"x": torch.zeros(100)}, good)
-    assert read_header(good)["x"]["shape"] == [100]
+    check_weights(tmp_path)
     data = good.read_bytes()
-    for damage, words in (
-        (data[:-1], "cut off"),
-        (data[:20], "cut off"),
-        (b"", "cut off"),
-        (b"\xff" * 64, "cut off"),
-        (data[:8] + b"[" + data[9:], "damaged table of contents"),
-    ):
+    for damage in (data[:-1], data[:20], b"", b"\xff" * 64, data[:8] + b"[" + data[9:]):
         good.write_bytes(damage)
-        with pytest.raises(OptionError, match=words):
+        with pytest.raises(OptionError, match="cut off or damaged"):
             check_weights(tmp_path)
     with pytest.raises(OptionError, match="holds no weights"):
         check_weights(tmp_path / "nothing")

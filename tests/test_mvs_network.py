@@ -75,7 +75,7 @@ def test_shipped_weights_are_small_and_damage_is_said(tmp_path: Path, monkeypatc
     (tmp_path / "weights.npz").write_bytes(SHIPPED.read_bytes()[:-2000])
     load_network.cache_clear()
     monkeypatch.setattr("list3r.reconstruction.mvs.weights.SHIPPED", tmp_path / "weights.npz")
-    colour = SourceInfo("folder", "walk", 9, 30.0, None, False, False, "relative", "x")
+    colour = SourceInfo("folder", "walk", 9, 30.0, None, False, False, "x")
     with pytest.raises(OptionError, match=r"network in weights\.npz .*install list3r again") as said:
         settings_asked(BuildRequest(), colour, "any")
     assert "\n" not in str(said.value)

@@ -37,7 +37,7 @@ class Sliding:
 
     @property
     def info(self) -> SourceInfo:
-        words = ("images", "sliding", self.count, 30.0, None, False, False, "relative", "")
+        words = ("images", "sliding", self.count, 30.0, None, False, False, "")
         return SourceInfo(*words, image_size=self.size)  # type: ignore[arg-type]
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:

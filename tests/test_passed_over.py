@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from list3r.cli.app import run
-from list3r.frames.base import BadFrame, Frame
+from list3r.frames.base import BadFrame, Frame, LazyFrame
 from list3r.frames.chunking.chunks import ChunkSettings, ChunkSpan
-from list3r.frames.deferred import LazyFrame, read_some
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.core.geometry import Sim3, rotation_exp
 from list3r.memory.library.evidence import EvidenceSettings, weigh
@@ -118,7 +117,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_source_reads_every_third_frame_now_and_the_others_later(walk: Path) -> None:
-    frames = list(read_some(open_source(walk), 2, 9, 3))
+    frames = list(open_source(walk).read_some(2, 9, 3))
     assert [f.index for f in frames] == list(range(2, 9))
     assert [isinstance(f, LazyFrame) for f in frames] == [True, False, True, True, False, True, True]
     whole = [f for f in open_source(walk).read(2, 9) if isinstance(f, Frame)]

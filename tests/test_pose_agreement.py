@@ -32,7 +32,7 @@ class Walk:
     def __init__(self, frames: list[Frame], camera: Camera = CAMERA) -> None:
         self._frames = frames
         has_depth = frames[0].depth is not None
-        self.info = SourceInfo("tum", "walk", len(frames), 30.0, camera, has_depth, True, "metric", "")
+        self.info = SourceInfo("tum", "walk", len(frames), 30.0, camera, has_depth, True, "")
 
     def read(self, start: int, stop: int) -> list[Frame]:
         return self._frames[start:stop]

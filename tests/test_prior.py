@@ -189,7 +189,7 @@ def test_the_edge_of_a_prior_says_where_the_chunk_lies_and_how_far_it_may_have_d
 
 def info(**changes: object) -> SourceInfo:
     known = {"kind": "record3d", "path": "walk.r3d", "frame_count": 9, "fps": 30.0, "camera": CAMERA, "z_up": True}
-    known |= {"has_depth": True, "has_poses": True, "scale_kind": "metric", "fingerprint": ""}
+    known |= {"has_depth": True, "has_poses": True, "fingerprint": ""}
     return SourceInfo(**(known | changes))  # type: ignore[arg-type]
 
 

@@ -25,7 +25,7 @@ from list3r.pipeline.finishing import check_run
 from list3r.pipeline.request import BuildRequest, RunArguments, RunOptions
 from list3r.pipeline.settings import AssociationSettings, BuildSettings
 
-INFO = SourceInfo("tum", "walk", 100, 30.0, Camera(320, 240, 260.0, 260.0, 159.5, 119.5), True, True, "metric", "f")
+INFO = SourceInfo("tum", "walk", 100, 30.0, Camera(320, 240, 260.0, 260.0, 159.5, 119.5), True, True, "f")
 BEGUN = BuildSettings(
     "rgbd", "given", chunks=ChunkSettings(40, 12), keep_pictures=False, association=AssociationSettings(solved_whole=9)
 )

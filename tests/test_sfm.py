@@ -59,7 +59,7 @@ class Held:
         size = frames[0].color.shape[:2]
         self._frames = frames
         self.info = SourceInfo(
-            "images", "here", len(frames), 30.0, camera, False, False, "relative", "", image_size=(size[0], size[1])
+            "images", "here", len(frames), 30.0, camera, False, False, "", image_size=(size[0], size[1])
         )
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:

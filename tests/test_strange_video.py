@@ -55,7 +55,7 @@ class Pictures:
     def __init__(self, colors: list[np.ndarray]) -> None:
         self.colors = colors
         size = colors[0].shape[:2]
-        self.info = SourceInfo("images", "here", len(colors), 30.0, None, False, False, "relative", "", size)
+        self.info = SourceInfo("images", "here", len(colors), 30.0, None, False, False, "", size)
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
         for n in range(len(self.colors))[start:stop]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.simulation.furnisher import HALF_WALL_M, Door, RoomPlan, door_middle, make_catalogue, moved
 from benchmarks.simulation.rooms import make_room
-from list3r.simulation.worlds.layout import Placer, Room
+from list3r.simulation.worlds.layout import Placer, SimulatedRoom
 from list3r.simulation.worlds.objects import SimulatedObject
 from list3r.simulation.worlds.world import SimulatedWorld
 
@@ -109,8 +109,8 @@ def make_building(settings: BuildingSettings, seed: int) -> Building:
     length = max([settings.length_m, *(room.x1 for row in rows for room in row)])
     plan = _corridor_plan(rng, settings, length, corridor_width, rows)
     corridor = _place(objects, "corridor", plan, make_room(Placer(rng), plan, catalogue), 0.0, None, False)
-    rooms = tuple(Room(r.x0, r.x1, r.y1 - r.y0, r.turn != 0, r.y0) for row in rows for r in row)
-    rooms += (Room(corridor.x0, corridor.x1, corridor_width, False),)
+    rooms = tuple(SimulatedRoom(r.x0, r.x1, r.y1 - r.y0, r.turn != 0, r.y0) for row in rows for r in row)
+    rooms += (SimulatedRoom(corridor.x0, corridor.x1, corridor_width, False),)
     return Building(SimulatedWorld(seed, rooms, tuple(objects), ()), corridor, rows[0], rows[1])
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from list3r.simulation.worlds import furniture as f
-from list3r.simulation.worlds.layout import Placer, Room
+from list3r.simulation.worlds.layout import Placer, SimulatedRoom
 from list3r.simulation.worlds.materials import Material
 from list3r.simulation.worlds.objects import SimulatedObject
 
@@ -17,7 +17,7 @@ HALF_WALL_M = 0.05
 DOOR_WIDTH_M = 0.95
 DOOR_HEIGHT_M = 2.05
 HEIGHT_M = 2.5
-HERE = Room(0.0, 1.0, 1.0, False)
+HERE = SimulatedRoom(0.0, 1.0, 1.0, False)
 """Coordinates as they are: the frame of a group, or of a room."""
 SIDES = ("south", "east", "north", "west")
 

@@ -123,14 +123,14 @@ def _published(job: BatchJob, output: Output, copy: Path) -> tuple[tuple[str, ..
 
 
 @dataclass(frozen=True)
-class _Known:
+class _FinishedBefore:
     """The outcome of a memory that was finished before its task was killed."""
 
     frames: int
     instances: int
 
 
-def _worked(job: BatchJob, work: Path, before: Path | None) -> BuildReport | UpdateReport | _Known:
+def _worked(job: BatchJob, work: Path, before: Path | None) -> BuildReport | UpdateReport | _FinishedBefore:
     """Build the file under way, or update the file published `before`, or resume either."""
     task = job.task
     known = _finished(work, before)
@@ -149,7 +149,7 @@ def _worked(job: BatchJob, work: Path, before: Path | None) -> BuildReport | Upd
     return update(work, source, options=task.options, settings=task.request, run=run)
 
 
-def _finished(work: Path, before: Path | None) -> _Known | None:
+def _finished(work: Path, before: Path | None) -> _FinishedBefore | None:
     """Return the content of the file under way if the whole video is in it; None where work is left."""
     if not work.exists():
         return None
@@ -161,7 +161,7 @@ def _finished(work: Path, before: Path | None) -> _Known | None:
         sessions = store.sessions.all()
         if len(sessions) <= known or sessions[-1].state != "complete":
             return None
-        return _Known(len(store.frames.all(sessions[-1].session_id)), store.instances.count()[0])
+        return _FinishedBefore(len(store.frames.all(sessions[-1].session_id)), store.instances.count()[0])
 
 
 @contextlib.contextmanager

@@ -14,9 +14,9 @@ import numpy as np
 import psycopg
 from numpy.typing import NDArray
 
-from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
+from list3r.catalog.base import INSTANCE, OF_ONE, Backend, Condition, check_dimension, filters_sql, wanted_sql
 from list3r.catalog.postgres_connections import Connections
-from list3r.catalog.postgres_schema import MIGRATIONS, lists_of, vector_index, vector_table
+from list3r.catalog.postgres_schema import SCHEMA, SCHEMA_VERSION, lists_of, vector_index, vector_table
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
@@ -26,13 +26,10 @@ from list3r.catalog.records import (
     SpaceVectors,
     Wanted,
 )
-from list3r.catalog.sqlite import check_dimension, instance_of
 from list3r.memory.store.search.vectors import unit
 
 _ENTRY_FIELDS = fields(MemoryEntry)
 _ENTRY = ", ".join(f"m.{f.name}" for f in _ENTRY_FIELDS)
-_OF_ONE = "i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
-_INSTANCE = f"m.name, {_OF_ONE}"
 _BUILD_MEMORY = "2GB"
 """Memory of the server while it makes an index of vectors."""
 _MOST_ALIKE = 10_000
@@ -45,7 +42,7 @@ _SCHEMA_LOCK = 0x4C334331
 """Number of the advisory lock under which the schema is made."""
 
 
-class PostgresBackend:
+class PostgresBackend(Backend):
     """A catalogue that many read and write at once. Credentials come from the environment or a service file."""
 
     def __init__(self, url: str, connections: int = 1) -> None:
@@ -54,12 +51,11 @@ class PostgresBackend:
         self._connections = Connections(url, connections)
         self._numbers: dict[str, int] = {}
         with self._connected("opened") as connection, connection.transaction():
-            self.has_vectors = _migrated(connection)
+            self.has_vectors = _made(connection)
 
     # ------------------------------------------------------------------ writing
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of the one with its name, in one transaction."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             spaces = self._spaces_for(connection, content.spaces)
             names, marks = ", ".join(f.name for f in _ENTRY_FIELDS), ", ".join("%s" for _ in _ENTRY_FIELDS)
@@ -106,7 +102,6 @@ class PostgresBackend:
         return out
 
     def drop(self, name: str) -> bool:
-        """Forget a memory; whether there was one."""
         with self._connected(_WRITTEN) as connection, connection.transaction():
             known = _first(connection.execute("DELETE FROM memory WHERE name = %s RETURNING memory_id", (name,)))
             if known:
@@ -139,30 +134,20 @@ class PostgresBackend:
 
     # ------------------------------------------------------------------ asking
 
-    def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
-        """Return entries by name."""
-        where, values = ("", ()) if names is None else (" WHERE m.name = ANY(?)", (list(names),))
-        rows = self._rows(f"SELECT m.memory_id, {_ENTRY} FROM memory m{where} ORDER BY m.name", values)
+    def _entries(self, names: Sequence[str] | None) -> list[Any]:
+        rows = super()._entries(names)
         self._numbers |= {str(name): int(number) for number, name, *_ in rows}
-        return [MemoryEntry(*row[1:]) for row in rows]
-
-    def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
-        """Return one instance."""
-        query = f"SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ? AND i.id = ?"
-        rows = self._rows(query, (self._number(memory), instance_id))
-        return _instance((memory, *rows[0])) if rows else None
+        return rows
 
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and the k nearest by axis-aligned boxes, through the index of boxes."""
         passing, values = filters_sql(filters, "i")
         return self._placed(memory, f"{passing} ORDER BY i.bounds <-> ?::cube LIMIT ?", [*values, _corner(point), k])
 
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and its instances whose axis-aligned boxes meet a box."""
         passing, values = filters_sql(filters, "i")
         region = f"{_corner(lower)},{_corner(upper)}"
         given = [region, *values, None if limit < 0 else limit]
@@ -176,7 +161,7 @@ class PostgresBackend:
         column: psycopg sends small numbers as `smallint`, for which the index of (memory, box) is scanned over all
         memories of the partition.
         """
-        chosen = f"(SELECT {_OF_ONE} FROM instance i WHERE i.memory_id = ?::integer AND {which}) i"
+        chosen = f"(SELECT {OF_ONE} FROM instance i WHERE i.memory_id = ?::integer AND {which}) i"
         query = f"SELECT {_ENTRY}, i.* FROM memory m LEFT JOIN {chosen} ON TRUE WHERE m.memory_id = ?"
         for _ in range(2):
             number = self._number(memory)
@@ -184,51 +169,11 @@ class PostgresBackend:
             if rows:
                 entry = MemoryEntry(*rows[0][: len(_ENTRY_FIELDS)])
                 of_instances = (row[len(_ENTRY_FIELDS) :] for row in rows)
-                return entry, [_instance((memory, *row)) for row in of_instances if row[0] is not None]
+                return entry, [self._instance((memory, *row)) for row in of_instances if row[0] is not None]
             self._numbers.pop(memory, None)
         return None
 
-    def named(
-        self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogInstance, float]], int]:
-        """Return the k that are wanted with how well the words name them."""
-        a, values = wanted_sql(wanted, "i", _bearing, joined=memory is None)
-        b, more = filters_sql(filters, "i")
-        only, given = ("", ()) if memory is None else (" AND i.memory_id = ?", (self._number(memory),))
-        weight = "(SELECT avg(w.n) FROM unnest(i.words, i.weights) w (word, n) WHERE w.word = ANY(?))"
-        query = (
-            f"WITH chosen AS MATERIALIZED (SELECT i.* FROM instance i WHERE {a} AND {b}{only} LIMIT {MOST_RANKED}) "
-            f"SELECT {_INSTANCE}, coalesce({weight}, 100) AS weight, (SELECT count(*) FROM chosen) "
-            "FROM chosen i JOIN memory m USING (memory_id) "
-            "ORDER BY weight DESC, i.confidence DESC, m.name, i.id LIMIT ?"
-        )
-        rows = self._rows(query, (*values, *more, *given, list(wanted.words), k))
-        return [(_instance(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
-
-    def related(
-        self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
-    ) -> list[tuple[str, int, str, str, int, str, float, float]]:
-        """Return relations, the surest first."""
-        (a, values), (b, more) = wanted_sql(subject, "s", _bearing), wanted_sql(object, "o", _bearing)
-        parts, given = [a, b], [*values, *more]
-        if memory is not None:
-            parts.append("r.memory_id = ?")
-            given.append(self._number(memory))
-        if predicate is not None:
-            parts.append("r.predicate = ?")
-            given.append(predicate)
-        query = (
-            "SELECT m.name, r.subject, coalesce(s.label, s.description), r.predicate, r.object, "
-            "coalesce(o.label, o.description), r.confidence, r.margin FROM relation r "
-            "JOIN instance s ON s.memory_id = r.memory_id AND s.id = r.subject "
-            "JOIN instance o ON o.memory_id = r.memory_id AND o.id = r.object "
-            "JOIN memory m ON m.memory_id = r.memory_id "
-            f"WHERE {' AND '.join(parts)} ORDER BY r.confidence DESC, m.name, r.subject, r.predicate, r.object LIMIT ?"
-        )
-        return self._rows(query, (*given, k))
-
     def spaces(self, memory: str | None) -> list[str]:
-        """Return the names of spaces that hold vectors. Raises `CatalogError` where the server has no pgvector."""
         self._need_vectors()
         known = self._rows("SELECT name, space_id FROM space ORDER BY name", ())
         if memory is None:
@@ -237,7 +182,6 @@ class PostgresBackend:
         return [str(name) for name, n in known if self._rows(query.format(int(n)), (number,))[0][0]]
 
     def dimension(self, space: str) -> int | None:
-        """Return how many numbers the vectors of a space have. Raises `CatalogError` where there is no pgvector."""
         self._need_vectors()
         rows = self._rows("SELECT dimension FROM space WHERE name = ?", (space,))
         return int(rows[0][0]) if rows else None
@@ -249,7 +193,6 @@ class PostgresBackend:
             )
 
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
-        """Return the vector of an instance."""
         query = f"SELECT v::real[] FROM vector_{self._space(space)} WHERE memory_id = ? AND id = ?"
         rows = self._rows(query, (self._number(memory), instance_id))
         return np.array(rows[0][0], np.float32) if rows else None
@@ -282,11 +225,11 @@ class PostgresBackend:
         """Return the given instances that pass the filters, by memory and id."""
         passing, values = filters_sql(filters, "i")
         query = (
-            f"SELECT {_INSTANCE}, i.memory_id FROM unnest(?::integer[], ?::bigint[]) a (memory_id, id) "
+            f"SELECT {INSTANCE}, i.memory_id FROM unnest(?::integer[], ?::bigint[]) a (memory_id, id) "
             f"JOIN instance i USING (memory_id, id) JOIN memory m USING (memory_id) WHERE {passing}"
         )
         rows = self._rows(query, ([n for n, _ in ids], [i for _, i in ids], *values))
-        return {(int(row[-1]), int(row[1])): _instance(row[:-1]) for row in rows}
+        return {(int(row[-1]), int(row[1])): self._instance(row[:-1]) for row in rows}
 
     def _number(self, memory: str) -> int:
         """Return the number that a memory had when it was last asked for, 0 where there is none of that name.
@@ -303,17 +246,20 @@ class PostgresBackend:
             raise CatalogError(f"the catalogue at {self._where} has no vectors of {space}")
         return int(rows[0][0])
 
-    def alive(self) -> bool:
-        """Whether the database answers."""
-        try:
-            self._rows("SELECT 1", ())
-        except CatalogError:
-            return False
-        return True
-
     def close(self) -> None:
-        """Let the connections go."""
         self._connections.close()
+
+    def _of(self, memory: str, alias: str) -> Condition:
+        return f"{alias}.memory_id = ?", [self._number(memory)]
+
+    def _wanted(self, wanted: Wanted, alias: str, memory: str | None, *, nested: bool = False) -> Condition:
+        return wanted_sql(wanted, alias, _bearing, joined=memory is None and not nested)
+
+    def _weight(self, words: Sequence[str]) -> Condition:
+        return "(SELECT avg(w.n) FROM unnest(i.words, i.weights) w (word, n) WHERE w.word = ANY(?))", [list(words)]
+
+    def _box(self, stored: Any) -> NDArray[np.float64]:
+        return np.array(stored, np.float64)
 
     def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
         """Ask; once more where the connection was lost, as when the server was started again meanwhile."""
@@ -374,26 +320,24 @@ def _first_line(error: Exception) -> str:
     return str(text).splitlines()[0]
 
 
-def _migrated(connection: psycopg.Connection[Any]) -> bool:
-    """Bring the schema up to date; return whether the database has vectors. Raises `CatalogError`."""
-    known = _first(connection.execute("SELECT to_regclass('list3r.version')"))[0]
-    done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0) if known else 0
-    if done > len(MIGRATIONS):
-        raise CatalogError(
-            f"the catalogue has schema {done} of a newer list3r; this one knows up to {len(MIGRATIONS)}; update list3r"
-        )
-    if done < len(MIGRATIONS):
+def _made(connection: psycopg.Connection[Any]) -> bool:
+    """Make the schema where there is none; return whether the database has vectors. Raises `CatalogError`."""
+    if not _first(connection.execute("SELECT to_regclass('list3r.version')"))[0]:
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_SCHEMA_LOCK,))
         connection.execute("CREATE SCHEMA IF NOT EXISTS list3r")
         connection.execute("CREATE TABLE IF NOT EXISTS version (number integer PRIMARY KEY)")
-        done = int(_first(connection.execute("SELECT max(number) FROM version"))[0] or 0)
         for name in ("cube", "btree_gist"):
             connection.execute(f"CREATE EXTENSION IF NOT EXISTS {name} SCHEMA public")
         if connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'vector'").fetchone():
             connection.execute("CREATE EXTENSION IF NOT EXISTS vector SCHEMA public")
-        for number, statements in enumerate(MIGRATIONS[done:], done + 1):
-            connection.execute(statements.encode())
-            connection.execute("INSERT INTO version VALUES (%s)", (number,))
+        if not connection.execute("SELECT 1 FROM version").fetchone():  # nobody made it meanwhile
+            connection.execute(SCHEMA.encode())
+            connection.execute("INSERT INTO version VALUES (%s)", (SCHEMA_VERSION,))
+    held = _first(connection.execute("SELECT max(number) FROM version"))[0]
+    if held != SCHEMA_VERSION:
+        raise CatalogError(
+            f"the catalogue has schema {held}, this list3r {SCHEMA_VERSION}: use the list3r that made it"
+        )
     return connection.execute("SELECT 1 FROM pg_extension WHERE extname = 'vector'").fetchone() is not None
 
 
@@ -477,7 +421,3 @@ def _marked(query: str) -> bytes:
 
 def _first(cursor: psycopg.Cursor[Any]) -> Any:
     return cursor.fetchone() or ()
-
-
-def _instance(row: Sequence[Any]) -> CatalogInstance:
-    return instance_of(row, np.array(row[9], np.float64))

@@ -1,4 +1,4 @@
-"""The schema of a catalogue in PostgreSQL: numbered migrations, append-only, each in a transaction."""
+"""The schema of a catalogue in PostgreSQL."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def _partitioned(table: str) -> str:
     )
 
 
-MIGRATIONS: tuple[str, ...] = (
-    f"""
+SCHEMA_VERSION = 1
+SCHEMA = f"""
     CREATE TABLE memory (
         memory_id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, name text NOT NULL UNIQUE, path text NOT NULL,
         revision integer NOT NULL, sha256 text NOT NULL, bytes bigint NOT NULL, mtime_ns bigint NOT NULL,
@@ -43,15 +43,7 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE TABLE space (
         space_id integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, name text NOT NULL UNIQUE,
         dimension integer NOT NULL);
-    """,
-    # Vectors are in lists since; the next load makes their index.
-    """
-    DO $$ DECLARE old text; BEGIN
-        FOR old IN SELECT indexname FROM pg_indexes WHERE schemaname = 'list3r' AND indexname ~ '^vector_[0-9]+_alike$'
-        LOOP EXECUTE format('DROP INDEX list3r.%I', old); END LOOP;
-    END $$;
-    """,
-)
+"""
 
 
 def vector_table(space_id: int, dimension: int) -> str:

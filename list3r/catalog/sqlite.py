@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.catalog.base import MOST_RANKED, filters_sql, wanted_sql
+from list3r.catalog.base import INSTANCE, Backend, Condition, check_dimension, filters_sql, wanted_sql
 from list3r.catalog.records import (
     CatalogError,
     CatalogFilters,
     CatalogInstance,
     MemoryContent,
     MemoryEntry,
-    SpaceVectors,
     Wanted,
 )
-from list3r.memory.core.geometry import OrientedBox
 from list3r.memory.store.search.vectors import unit
 
 _APPLICATION_ID = 0x4C334331
@@ -51,8 +49,6 @@ CREATE TABLE IF NOT EXISTS vector (
     space TEXT NOT NULL, memory_id INTEGER NOT NULL REFERENCES memory, id INTEGER NOT NULL, v BLOB NOT NULL,
     PRIMARY KEY (space, memory_id, id)) WITHOUT ROWID;
 """
-_ENTRY = ", ".join(f"m.{f.name}" for f in fields(MemoryEntry))
-_INSTANCE = "m.name, i.id, i.label, i.description, i.state, i.structure, i.confidence, i.sigma, i.component, i.box"
 _FROM = "FROM instance i JOIN memory m ON m.memory_id = i.memory_id"
 _OF_MEMORY = "i.memory_id = (SELECT memory_id FROM memory WHERE name = ?)"
 _BATCH = 20_000
@@ -60,7 +56,7 @@ _GROW = 2.0
 """Factor by which a search distance grows when it finds too few."""
 
 
-class SqliteBackend:
+class SqliteBackend(Backend):
     """A catalogue in a file; one process writes while others read."""
 
     def __init__(self, path: str) -> None:
@@ -84,7 +80,6 @@ class SqliteBackend:
         return bool(self._database.execute("SELECT 1 FROM sqlite_master").fetchone())
 
     def put(self, content: MemoryContent, *, again: bool = False) -> MemoryEntry:
-        """Write a memory in place of the one with its name."""
         with self._writing():
             known = self.memories([content.entry.name])
             before = known[0] if known else content.entry
@@ -125,11 +120,9 @@ class SqliteBackend:
 
     @contextlib.contextmanager
     def loading(self, *, many: bool) -> Iterator[None]:
-        """Write memories: nothing is to be made again here."""
         yield
 
     def drop(self, name: str) -> bool:
-        """Forget a memory; whether there was one."""
         with self._writing():
             known = bool(self.memories([name]))
             if known:
@@ -144,27 +137,9 @@ class SqliteBackend:
         for table in ("instance", "relation", "vector", "memory"):
             self._database.execute(f"DELETE FROM {table} WHERE memory_id = ?", (memory,))
 
-    def memories(self, names: Sequence[str] | None = None) -> list[MemoryEntry]:
-        """Return entries by name."""
-        if names is None:
-            rows = self._rows(f"SELECT {_ENTRY} FROM memory m ORDER BY m.name", ())
-        else:
-            rows = [
-                r
-                for n in sorted(set(names))
-                for r in self._rows(f"SELECT {_ENTRY} FROM memory m WHERE m.name = ?", (n,))
-            ]
-        return [MemoryEntry(*row) for row in rows]
-
-    def instance(self, memory: str, instance_id: int) -> CatalogInstance | None:
-        """Return one instance."""
-        rows = self._rows(f"SELECT {_INSTANCE} {_FROM} WHERE {_OF_MEMORY} AND i.id = ?", (memory, instance_id))
-        return _instance(rows[0]) if rows else None
-
     def near(
         self, memory: str, point: Sequence[float], k: int, filters: CatalogFilters
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and the k nearest by axis-aligned boxes."""
         entry = self.memories([memory])
         return (entry[0], self._near(memory, np.asarray(point, np.float64), k, filters)) if entry else None
 
@@ -195,7 +170,6 @@ class SqliteBackend:
     def inside(
         self, memory: str, lower: Sequence[float], upper: Sequence[float], filters: CatalogFilters, limit: int
     ) -> tuple[MemoryEntry, list[CatalogInstance]] | None:
-        """Return a memory and its instances whose axis-aligned boxes meet a box."""
         entry = self.memories([memory])
         return (entry[0], self._inside(memory, lower, upper, filters, limit)) if entry else None
 
@@ -206,67 +180,24 @@ class SqliteBackend:
         passing, values = filters_sql(filters, "i")
         low, high = lower, upper
         query = (
-            f"SELECT {_INSTANCE} FROM bounds b JOIN instance i ON i.number = b.number JOIN memory m USING (memory_id) "
+            f"SELECT {INSTANCE} FROM bounds b JOIN instance i ON i.number = b.number JOIN memory m USING (memory_id) "
             "WHERE b.min_memory <= (SELECT memory_id FROM memory WHERE name = ?) "
             "AND b.max_memory >= (SELECT memory_id FROM memory WHERE name = ?) "
             "AND b.max_x >= ? AND b.min_x <= ? AND b.max_y >= ? AND b.min_y <= ? AND b.max_z >= ? AND b.min_z <= ? "
             f"AND {passing} ORDER BY i.id LIMIT ?"
         )
         ends = [v for pair in zip(low, high, strict=True) for v in pair]
-        return [_instance(row) for row in self._rows(query, (memory, memory, *ends, *values, limit))]
-
-    def named(
-        self, memory: str | None, wanted: Wanted, k: int, filters: CatalogFilters
-    ) -> tuple[list[tuple[CatalogInstance, float]], int]:
-        """Return the k that are wanted with how well the words name them."""
-        where, values = _where(memory, wanted, filters)
-        marks = ", ".join("?" for _ in wanted.words)
-        weight = (
-            f"(SELECT avg(weight) FROM word w WHERE w.number = i.number AND w.word IN ({marks}))" if marks else "100"
-        )
-        query = (
-            f"WITH chosen AS MATERIALIZED (SELECT i.number {_FROM} WHERE {where} LIMIT {MOST_RANKED}) "
-            f"SELECT {_INSTANCE}, {weight} AS weight, (SELECT count(*) FROM chosen) "
-            "FROM chosen JOIN instance i USING (number) JOIN memory m USING (memory_id) "
-            "ORDER BY weight DESC, i.confidence DESC, m.name, i.id LIMIT ?"
-        )
-        rows = self._rows(query, (*values, *wanted.words, k))
-        return [(_instance(r[:-2]), float(r[-2]) / 100.0) for r in rows], int(rows[0][-1]) if rows else 0
-
-    def related(
-        self, memory: str | None, subject: Wanted, predicate: str | None, object: Wanted, k: int
-    ) -> list[tuple[str, int, str, str, int, str, float, float]]:
-        """Return relations, the surest first."""
-        bearing = _bearing if memory is None else _bearing_here
-        (a, values), (b, more) = wanted_sql(subject, "s", bearing), wanted_sql(object, "o", bearing)
-        parts, given = [a, b], [*values, *more]
-        if memory is not None:
-            parts.append(_OF_MEMORY.replace("i.", "r."))
-            given.append(memory)
-        if predicate is not None:
-            parts.append("r.predicate = ?")
-            given.append(predicate)
-        query = (
-            "SELECT m.name, r.subject, coalesce(s.label, s.description), r.predicate, r.object, "
-            "coalesce(o.label, o.description), r.confidence, r.margin FROM relation r JOIN memory m USING (memory_id) "
-            "JOIN instance s ON s.memory_id = r.memory_id AND s.id = r.subject "
-            "JOIN instance o ON o.memory_id = r.memory_id AND o.id = r.object "
-            f"WHERE {' AND '.join(parts)} ORDER BY r.confidence DESC, m.name, r.subject, r.predicate, r.object LIMIT ?"
-        )
-        return [tuple(row) for row in self._rows(query, (*given, k))]
+        return [self._instance(row) for row in self._rows(query, (memory, memory, *ends, *values, limit))]
 
     def spaces(self, memory: str | None) -> list[str]:
-        """Return the names of spaces that hold vectors."""
         where, values = ("", ()) if memory is None else (f"WHERE {_OF_MEMORY.replace('i.', '')}", (memory,))
         return [str(s) for (s,) in self._rows(f"SELECT DISTINCT space FROM vector {where} ORDER BY space", values)]
 
     def dimension(self, space: str) -> int | None:
-        """Return how many numbers the vectors of a space have."""
         rows = self._rows("SELECT length(v) FROM vector WHERE space = ? LIMIT 1", (space,))
         return int(rows[0][0]) // 2 if rows else None
 
     def vector(self, memory: str, instance_id: int, space: str) -> NDArray[np.float32] | None:
-        """Return the vector of an instance."""
         query = f"SELECT v FROM vector i WHERE space = ? AND {_OF_MEMORY} AND id = ?"
         rows = self._rows(query, (space, memory, instance_id))
         return np.frombuffer(rows[0][0], "<f2").astype(np.float32) if rows else None
@@ -274,7 +205,6 @@ class SqliteBackend:
     def alike(
         self, memory: str | None, space: str, vector: NDArray[np.float32], k: int, filters: CatalogFilters
     ) -> list[tuple[CatalogInstance, float]]:
-        """Return the k most alike: all vectors are compared, so the answer is exact."""
         passing, values = filters_sql(filters, "i")
         only, given = ("", ()) if memory is None else (f" AND {_OF_MEMORY}", (memory,))
         query = (
@@ -289,20 +219,24 @@ class SqliteBackend:
                 both = np.column_stack([held @ vector, [n for n, _ in some]])
                 best = np.concatenate([best, both])
                 best = best[np.lexsort((best[:, 1], -best[:, 0]))[:k]]
-            query = f"SELECT {_INSTANCE} {_FROM} WHERE i.number = ?"
-            return [(_instance(self._database.execute(query, (int(n),)).fetchone()), float(c)) for c, n in best]
-
-    def alive(self) -> bool:
-        """Whether the file can be read."""
-        try:
-            self._rows("SELECT 1 FROM memory LIMIT 1", ())
-        except CatalogError:
-            return False
-        return True
+            query = f"SELECT {INSTANCE} {_FROM} WHERE i.number = ?"
+            return [(self._instance(self._database.execute(query, (int(n),)).fetchone()), float(c)) for c, n in best]
 
     def close(self) -> None:
-        """Close the file."""
         self._database.close()
+
+    def _of(self, memory: str, alias: str) -> Condition:
+        return _OF_MEMORY.replace("i.", f"{alias}."), [memory]
+
+    def _wanted(self, wanted: Wanted, alias: str, memory: str | None, *, nested: bool = False) -> Condition:
+        return wanted_sql(wanted, alias, _bearing if memory is None else _bearing_here)
+
+    def _weight(self, words: Sequence[str]) -> Condition:
+        marks = ", ".join("?" for _ in words)
+        return f"(SELECT avg(weight) FROM word w WHERE w.number = i.number AND w.word IN ({marks}))", list(words)
+
+    def _box(self, stored: Any) -> NDArray[np.float64]:
+        return np.frombuffer(stored, "<f4").astype(np.float64)
 
     def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
         with self._reading():
@@ -347,34 +281,3 @@ def _bearing_here(alias: str, words: Sequence[str]) -> tuple[str, list[Any]]:
     """In one memory: each of its instances is tested."""
     one = f"EXISTS (SELECT 1 FROM word WHERE word = ? AND number = {alias}.number)"
     return " AND ".join([one] * len(words)), list(words)
-
-
-def _where(memory: str | None, wanted: Wanted, filters: CatalogFilters) -> tuple[str, list[Any]]:
-    bearing = _bearing if memory is None else _bearing_here
-    (a, values), (b, more) = wanted_sql(wanted, "i", bearing), filters_sql(filters, "i")
-    if memory is None:
-        return f"{a} AND {b}", [*values, *more]
-    return f"{a} AND {b} AND {_OF_MEMORY}", [*values, *more, memory]
-
-
-def _instance(row: Sequence[Any]) -> CatalogInstance:
-    return instance_of(row, np.frombuffer(row[9], "<f4").astype(np.float64))
-
-
-def instance_of(row: Sequence[Any], box: NDArray[np.float64]) -> CatalogInstance:
-    """Return an instance of a row of its fields and the 15 numbers of its box."""
-    memory, id, label, description, state, structure, confidence, sigma, component = row[:9]
-    values = (label, description, state, structure, confidence, sigma, component)
-    return CatalogInstance(memory, id, *values, box_of(box), {})
-
-
-def box_of(numbers: NDArray[np.float64]) -> OrientedBox:
-    """Return the box of its 15 numbers: centre, size, rotation."""
-    return OrientedBox(numbers[:3], numbers[3:6], numbers[6:].reshape(3, 3))
-
-
-def check_dimension(held: SpaceVectors, known: int | None) -> None:
-    """Raise `CatalogError` for vectors of another dimension than a space is known to have."""
-    numbers = held.vectors.shape[1]
-    if known is not None and numbers != known:
-        raise CatalogError(f"vectors of {numbers} numbers do not belong to {held.space}, which has {known}")

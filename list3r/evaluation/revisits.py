@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -302,27 +303,20 @@ def _chunk_pairs(
     """Return pairs of chunks that are revisits, and pairs that see different places throughout."""
     rows = {k: np.flatnonzero((frame >= first) & (frame <= last)) for k, (first, last) in spans.items()}
     true_pairs, false_pairs = set(), set()
-    ids = sorted(spans)
-    for n, u in enumerate(ids):
-        for v in ids[n + 1 :]:
-            if (u, v) in neighbours or not len(rows[u]) or not len(rows[v]):
-                continue
-            block = np.ix_(rows[u], rows[v])
-            if same[block].any():
-                true_pairs.add((u, v))
-            elif apart[block].all():
-                false_pairs.add((u, v))
+    for u, v in combinations(sorted(spans), 2):
+        if (u, v) in neighbours or not len(rows[u]) or not len(rows[v]):
+            continue
+        block = np.ix_(rows[u], rows[v])
+        if same[block].any():
+            true_pairs.add((u, v))
+        elif apart[block].all():
+            false_pairs.add((u, v))
     return true_pairs, false_pairs
 
 
 def _sharing(spans: Mapping[int, tuple[int, int]]) -> list[tuple[int, int]]:
-    ids = sorted(spans)
-    return [
-        (u, v)
-        for n, u in enumerate(ids)
-        for v in ids[n + 1 :]
-        if spans[v][0] <= spans[u][1] and spans[u][0] <= spans[v][1]
-    ]
+    pairs = combinations(sorted(spans), 2)
+    return [(u, v) for u, v in pairs if spans[v][0] <= spans[u][1] and spans[u][0] <= spans[v][1]]
 
 
 def _nearest_rows(frame: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from list3r.frames.selection import FrameSelection
 
 Listing = Callable[[int, int], None]
 """Hears how far a recording is listed: parts looked at, and in all."""
@@ -90,8 +94,6 @@ class SourceInfo:
     """Pinhole camera of the frames handed out, None where the intrinsics are unknown."""
     has_depth: bool
     has_poses: bool
-    scale_kind: str
-    """metric or relative."""
     fingerprint: str
     """Changes when the source or the options that shape its frames change; guards `--resume`."""
     depth_camera: Camera | None = None
@@ -102,8 +104,6 @@ class SourceInfo:
     """Stored depth units per metre."""
     notes: tuple[str, ...] = field(default=())
     """What was assumed, one sentence each."""
-    missing: tuple[str, ...] = field(default=())
-    """What is missing and which option supplies it, one sentence each."""
     image_size: tuple[int, int] | None = None
     """Height and width of the frames handed out, px."""
     stored_size: tuple[int, int] | None = None
@@ -121,18 +121,21 @@ class SourceInfo:
     camera_guess: Camera | None = None
     """What the files' own words (EXIF) say of an unknown camera: good to a few per cent, a start and no more."""
 
+    @property
+    def scale_kind(self) -> str:
+        """metric or relative."""
+        return "metric" if self.has_depth else "relative"
 
-def missing_parts(*, depth: bool, camera: bool) -> list[str]:
-    """Return what a source lacks of depth and the camera's intrinsics, and what then is done, one sentence each."""
-    out = [] if depth else ["there is no depth: build takes colour alone (--reconstruction sfm or a network)"]
-    if not camera:
-        done = (
-            "give --intrinsics fx,fy,cx,cy"
-            if depth
-            else "build estimates them; --intrinsics fx,fy,cx,cy is more accurate"
-        )
-        out.append(f"the camera's intrinsics are unknown: {done}")
-    return out
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What is missing, and what then is done, one sentence each."""
+        lacking = "there is no depth: build takes colour alone (--reconstruction sfm or a network)"
+        out = [] if self.has_depth else [lacking]
+        if self.camera is None:
+            option = "--intrinsics fx,fy,cx,cy"
+            done = f"give {option}" if self.has_depth else f"build estimates them; {option} is more accurate"
+            out.append(f"the camera's intrinsics are unknown: {done}")
+        return tuple(out)
 
 
 GUESSED_FOCAL = 1.2
@@ -158,31 +161,46 @@ class BadFrame:
     reason: str
 
 
-class FrameSource(Protocol):
+class LazyFrame(Frame):
+    """A frame whose colour and depth are read when one of them is first asked for: of a slow video most never are.
+
+    One that then cannot be decoded is black and has no depth.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        time_s: float,
+        T_source_cam: NDArray[np.float64] | None,
+        read: Callable[[], Frame | BadFrame],
+    ) -> None:
+        self.__dict__.update(index=index, time_s=time_s, T_source_cam=T_source_cam, _read=read)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("color", "depth"):
+            raise AttributeError(name)
+        frame = self.__dict__["_read"]()
+        if isinstance(frame, BadFrame):
+            frame = Frame(self.index, self.time_s, np.zeros((1, 1, 3), np.uint8), None, None)
+        self.__dict__.update(color=frame.color, depth=frame.depth)
+        return self.__dict__[name]
+
+    def let_go(self) -> None:
+        """Forget the picture, which is read again where it is asked for again."""
+        for name in ("color", "depth"):
+            self.__dict__.pop(name, None)
+
+
+class FrameSource(ABC):
     """Frames by position. A source can be opened again in another process by `open_source` with the same options."""
+
+    _info: SourceInfo
+    _chosen: FrameSelection
+    """The frames handed out; sources that hold others have their `position`."""
 
     @property
     def info(self) -> SourceInfo:
         """What was recognised. Cheap: nothing is decoded beyond a first frame."""
-        ...
-
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        """Frames at positions [start, stop) in order; one that cannot be decoded comes as a `BadFrame`."""
-        ...
-
-    def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
-        ...
-
-
-class Reader(ABC):
-    """What the readers of recordings share: a `FrameSource` that can also read every N-th frame."""
-
-    _info: SourceInfo
-
-    @property
-    def info(self) -> SourceInfo:
-        """What was recognised."""
         return self._info
 
     def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
@@ -193,9 +211,44 @@ class Reader(ABC):
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
         """As `read`, but only each `step`-th frame from `start` on."""
 
-    @abstractmethod
     def position(self, index: int) -> int:
         """Return where a frame (Frame.index) is among those handed out."""
+        return self._chosen.position(index)
+
+    def read_some(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        """As `read`, but the pictures of frames at positions that are no multiple of `step` are read when looked at."""
+        for position, frame in enumerate(self.read(start, stop), start):
+            if position % step and isinstance(frame, Frame):
+                again = partial(lambda at: next(iter(self.read(at, at + 1))), position)
+                frame = LazyFrame(frame.index, frame.time_s, frame.T_source_cam, again)
+            yield frame
+
+    def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
+        """Frame.index, seconds and pose of the colour camera of every frame that has one; no picture is decoded."""
+        return []
+
+    def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
+        """Grey pictures at positions [start, stop), large enough for local features; None for one that is damaged."""
+        import cv2
+
+        for frame in self.read(start, stop):
+            gray = None if isinstance(frame, BadFrame) else cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+            yield None if gray is None else np.asarray(gray, np.uint8)
+
+    def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
+        """Small grey pictures of all frames in order, in one pass; None for one that is damaged."""
+        return self.read_grays(0, self.info.frame_count)
+
+    def look(self, spots: int) -> Iterator[tuple[int, str]]:
+        """Frame.index of frames at so many places and why each cannot be used, empty where it can.
+
+        The steps between the places are not even, which misses no pattern.
+        """
+        count = self.info.frame_count
+        places = np.linspace(0, 1, min(spots, count)) ** (1.0 if count < spots else 1.1)
+        for position in np.unique((places * (count - 1)).round().astype(int)).tolist():
+            for frame in self.read(position, position + 1):
+                yield frame.index, frame.reason if isinstance(frame, BadFrame) else ""
 
 
 def index_at(source: FrameSource, position: int) -> int:

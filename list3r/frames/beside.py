@@ -85,7 +85,7 @@ def is_deep(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class Found:
+class FilesBeside:
     """The pictures of a folder and what lies beside them, by what it is."""
 
     colors: list[Path]
@@ -94,7 +94,7 @@ class Found:
     notes: tuple[str, ...] = ()
 
 
-def look(root: Path, *, alone: bool = False) -> Found | None:
+def look(root: Path, *, alone: bool = False) -> FilesBeside | None:
     """The pictures in a folder, or in the one of its folders that is named as such; None where there are none.
 
     `alone`: depth that lies beside the folder itself may be left. Raises `SourceError` for a folder of depth, and where
@@ -118,7 +118,7 @@ def look(root: Path, *, alone: bool = False) -> Found | None:
     confidences = inside["confidence"] or _folder_of("confidence", others)
     masks = len(inside["mask"])
     notes = (f"{masks} images beside the pictures are named as masks and not read",) if masks else ()
-    return Found(inside["color"], depths, confidences, notes)
+    return FilesBeside(inside["color"], depths, confidences, notes)
 
 
 def _by_role(folder: Path) -> dict[Role, list[Path]]:
@@ -192,7 +192,7 @@ _REGISTERED = re.compile("regist|align", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Pairs:
+class FilePairs:
     """For each picture what belongs to it, None for nothing."""
 
     files: list[Path | None]
@@ -202,7 +202,7 @@ class Pairs:
     """Seconds of the pictures, where the list of pairs states them. Shape (N,)."""
 
 
-def pair(root: Path, colors: Sequence[Path], others: Sequence[Path], what: str) -> Pairs:
+def pair(root: Path, colors: Sequence[Path], others: Sequence[Path], what: str) -> FilePairs:
     """Bring together pictures and depth or confidence: by a list, or their names, numbers, times or order.
 
     Raises `SourceError` where nothing fits.
@@ -216,7 +216,7 @@ def pair(root: Path, colors: Sequence[Path], others: Sequence[Path], what: str) 
         whole = len(named) == len(others) and len({keys(c) for c in colors}) == len(colors)
         known = len(others) - len({f for f in files if f})
         if whole and any(files) and (keys is _stem or not known or len(colors) != len(others)):
-            return Pairs(files, how)
+            return FilePairs(files, how)
     times, other_s = times_of_names(colors), times_of_names(others)
     if times is not None and other_s is not None:
         found = associate(times, other_s, MAX_PAIR_GAP_S)
@@ -224,9 +224,9 @@ def pair(root: Path, colors: Sequence[Path], others: Sequence[Path], what: str) 
         for c, d in found.tolist():
             files[c] = others[d]
         if len(found):
-            return Pairs(files, "the times in their names")
+            return FilePairs(files, "the times in their names")
     elif len(colors) == len(others):
-        return Pairs(list(others), "order")
+        return FilePairs(list(others), "order")
     raise SourceError(
         f"{root}: {what} beside the pictures has {len(others)} images, none of which has the name, number or time of "
         f"one of the {len(colors)} pictures; name them alike, list the pairs in associations.txt, or use --kind images "
@@ -249,7 +249,7 @@ def _digits(path: Path) -> tuple[int, ...]:
     return tuple(int(d) for d in re.findall(r"\d+", path.stem))
 
 
-def _by_list(path: Path, colors: Sequence[Path], others: Sequence[Path]) -> Pairs:
+def _by_list(path: Path, colors: Sequence[Path], others: Sequence[Path]) -> FilePairs:
     """The pairs that a list states, a row each, with times before the names or without."""
     place = {p: k for k, p in enumerate(colors)}
     known = set(others)
@@ -267,7 +267,7 @@ def _by_list(path: Path, colors: Sequence[Path], others: Sequence[Path]) -> Pair
             times_s[place[named[color]]] = float(words[color - 1])
     if not any(files):
         raise SourceError(f"{path} names no picture together with a depth image that is there; fix or remove it")
-    return Pairs(files, path.name, as_seconds(times_s) if np.isfinite(times_s).all() else None)
+    return FilePairs(files, path.name, as_seconds(times_s) if np.isfinite(times_s).all() else None)
 
 
 # ---------------------------------------------------------------------------------------------- the law
@@ -300,6 +300,9 @@ def depth_beside(colors: Path) -> str:
     return ""
 
 
+_DEPTH_WANTED = "16-bit PNG, TIFF, NumPy or EXR images named as the pictures are, in depth/"
+_POSES_WANTED = "poses.txt with a row for each picture (12 numbers, or time_s tx ty tz qx qy qz qw)"
+_CAMERA_WANTED = "calibration.txt (fx fy cx cy) or --intrinsics fx,fy,cx,cy"
 _TEXTS = (".txt", ".json", ".xml", ".yaml", ".yml", ".csv", ".md")
 
 
@@ -310,15 +313,14 @@ def refuse_left(root: Path, kind: str, left: Iterable[str], *, depth: bool, pose
     """
     for name in left:
         base = name.rstrip("/").rsplit("/", 1)[-1]
-        if not depth and _looks_deep(root / name):
-            what, wanted = "depth", "16-bit PNG, TIFF, NumPy or EXR images named as the pictures are, in depth/"
-        elif not poses and _POSES.fullmatch(base):
-            what, wanted = "poses", "poses.txt with a row for each picture (12 numbers, or time_s tx ty tz qx qy qz qw)"
-        elif not camera and _CAMERA.fullmatch(base):
-            what, wanted = "a camera", "calibration.txt (fx fy cx cy) or --intrinsics fx,fy,cx,cy"
-        else:
-            continue
-        raise SourceError(
-            f"{root}: {name} looks like {what} of these pictures in a form that is not read; give {wanted}, or use "
-            f"--kind {kind} to go on without it"
+        looks = (
+            (not depth and _looks_deep(root / name), "depth", _DEPTH_WANTED),
+            (not poses and _POSES.fullmatch(base), "poses", _POSES_WANTED),
+            (not camera and _CAMERA.fullmatch(base), "a camera", _CAMERA_WANTED),
         )
+        what, wanted = next(((what, wanted) for alike, what, wanted in looks if alike), ("", ""))
+        if what:
+            raise SourceError(
+                f"{root}: {name} looks like {what} of these pictures in a form that is not read; give {wanted}, or use "
+                f"--kind {kind} to go on without it"
+            )

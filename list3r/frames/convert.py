@@ -6,38 +6,24 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 
 from list3r.frames.base import BadFrame, FrameSource
 from list3r.frames.options import SourceOptions
 from list3r.frames.pose_agreement import disagreements
 from list3r.frames.source import check_bad_share, open_source, require_camera
-from list3r.frames.writers.base import MakeWriter, SequenceWriter
+from list3r.frames.writers.base import SequenceWriter
+from list3r.frames.writers.folders import ColmapWriter, ReplicaWriter, TransformsWriter, TumWriter
+from list3r.frames.writers.record3d import Record3dWriter
 from list3r.memory.core.errors import ExportError, SourceError, check_choice
 from list3r.memory.core.records import JsonFields
 
-
-@dataclass(frozen=True)
-class OutputLayout:
-    """A layout that can be written."""
-
-    writer: str
-    """Module and class under `list3r.frames.writers`."""
-    depth: bool = True
-    """Whether it holds depth."""
-    unposed: bool = True
-    """Whether it holds frames without a pose."""
-    most_depth_m: float = float("inf")
-    """Depth beyond this does not fit into its numbers, metres."""
-
-
-LAYOUTS: dict[str, OutputLayout] = {
-    "tum": OutputLayout("tum.TumWriter", most_depth_m=13.1),
-    "transforms": OutputLayout("transforms.TransformsWriter", unposed=False, most_depth_m=65.5),
-    "colmap": OutputLayout("colmap.ColmapWriter", depth=False),
-    "replica": OutputLayout("replica.ReplicaWriter", unposed=False, most_depth_m=10.0),
-    "r3d": OutputLayout("record3d.Record3dWriter"),
+LAYOUTS: dict[str, type[SequenceWriter]] = {
+    "tum": TumWriter,
+    "transforms": TransformsWriter,
+    "colmap": ColmapWriter,
+    "replica": ReplicaWriter,
+    "r3d": Record3dWriter,
 }
 """All that `--to` knows."""
 
@@ -70,14 +56,15 @@ def convert(
     Pictures are written without distortion, depth on their pixels, poses as the source gives them. Raises
     `OptionError`, `SourceError`, and `ExportError` for a folder that exists or cannot be written.
     """
-    target, how = Path(folder), _layout(layout)
+    check_choice("--to", layout, LAYOUTS)
+    target, how = Path(folder), LAYOUTS[layout]
     opened = open_source(source, options)
     (options or SourceOptions()).check_fits(opened.info)
     _check(opened, how, layout, target)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         temporary.mkdir()
-        writer = _writer(how)(temporary, require_camera(opened.info), opened.info.fps)
+        writer = how(temporary, require_camera(opened.info), opened.info.fps)
         report = _write(opened, writer, layout, target, progress)
         temporary.rename(target)
     except OSError as error:
@@ -87,18 +74,7 @@ def convert(
     return replace(report, notes=(*report.notes, *disagreements(opened)))
 
 
-def _layout(name: str) -> OutputLayout:
-    check_choice("--to", name, LAYOUTS)
-    return LAYOUTS[name]
-
-
-def _writer(layout: OutputLayout) -> MakeWriter:
-    module, _, name = layout.writer.partition(".")
-    made = getattr(import_module(f"list3r.frames.writers.{module}"), name)
-    return made  # type: ignore[no-any-return]
-
-
-def _check(opened: FrameSource, how: OutputLayout, layout: str, target: Path) -> None:
+def _check(opened: FrameSource, how: type[SequenceWriter], layout: str, target: Path) -> None:
     if target.exists():
         raise ExportError(f"{target} already exists; name another folder or remove it first")
     if not target.parent.is_dir():
@@ -111,7 +87,7 @@ def _check(opened: FrameSource, how: OutputLayout, layout: str, target: Path) ->
 def _write(
     opened: FrameSource, writer: SequenceWriter, layout: str, target: Path, progress: Callable[[int, int], None]
 ) -> Converted:
-    how, count = LAYOUTS[layout], opened.info.frame_count
+    count = opened.info.frame_count
     written = with_depth = posed = bad = left_out = far = 0
     reason = ""
     for done, frame in enumerate(opened.read(0, count), start=1):
@@ -119,22 +95,22 @@ def _write(
         if isinstance(frame, BadFrame):
             bad, reason = bad + 1, reason or frame.reason
             continue
-        if frame.T_source_cam is None and not how.unposed:
+        if frame.T_source_cam is None and not writer.unposed:
             left_out += 1
             continue
         writer.add(frame)
         written, with_depth = written + 1, with_depth + (frame.depth is not None)
         posed += frame.T_source_cam is not None
-        far += frame.depth is not None and bool(frame.depth.max(initial=0.0) > how.most_depth_m)
+        far += frame.depth is not None and bool(frame.depth.max(initial=0.0) > writer.most_depth_m)
     check_bad_share(bad, count, reason)
     if not written:
         raise SourceError(f"{opened.info.path} has no frame with a pose, which {layout} needs; use tum, colmap or r3d")
     writer.close()
     notes = []
-    if with_depth and not how.depth:
+    if with_depth and not writer.depth:
         notes.append(f"{layout} holds no depth: it was left out")
     if left_out:
         notes.append(f"{left_out} frames without a pose were left out")
     if far:
-        notes.append(f"depth beyond {how.most_depth_m:g} m does not fit into {layout}: unknown in {far} frames")
-    return Converted(layout, str(target), written, with_depth * how.depth, posed, bad, tuple(notes))
+        notes.append(f"depth beyond {writer.most_depth_m:g} m does not fit into {layout}: unknown in {far} frames")
+    return Converted(layout, str(target), written, with_depth * writer.depth, posed, bad, tuple(notes))

@@ -6,6 +6,7 @@ import errno
 import os
 import stat
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -68,21 +69,27 @@ def _claimed_size(data: bytes) -> tuple[int, int] | None:
     return _size_of_others(data)
 
 
+_FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+
+
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     """Return the largest frame that any header before the first scan claims (ITU-T T.81, B.2.2)."""
-    at, found = 2, None
-    while at + 9 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+    places = [at for marker, at in jpeg_segments(data) if marker in _FRAME_HEADERS and at + 9 <= len(data)]
+    sizes: list[tuple[int, int]] = [struct.unpack(">HH", data[at + 5 : at + 9])[::-1] for at in places]  # type: ignore[misc]
+    return max(sizes, key=lambda size: size[0] * size[1], default=None)
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield marker and place of the segments of a JPEG up to its first scan, or to where they break off (marker 0)."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF:
-            at += 1
-        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:
-            at += 2
-        else:
-            if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-                height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-                found = max(found or (0, 0), (width, height), key=lambda s: s[0] * s[1])
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return found
+        yield marker, at
+        if marker == 0xDA:
+            return
+        alone = marker in (0x01, 0xFF) or 0xD0 <= marker <= 0xD8  # markers without a segment, and filling
+        at += (1 if marker == 0xFF else 2) if alone else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    yield 0, at
 
 
 def _size_of_others(data: bytes) -> tuple[int, int] | None:

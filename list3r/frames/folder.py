@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, LazyFrame, SourceInfo
 from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import (
     clean_depth,
@@ -29,8 +29,7 @@ from list3r.frames.decoding.decode import (
     used_bits,
 )
 from list3r.frames.decoding.exif import exif_focal, stated_size
-from list3r.frames.decoding.shown import LOOKED_AT, Shown, check_no_panorama, shown_note, shown_part
-from list3r.frames.deferred import LazyFrame
+from list3r.frames.decoding.shown import LOOKED_AT, ShownPart, check_no_panorama, shown_note, shown_part
 from list3r.frames.layout import FolderLayout, pose_matrix, read_numbers
 from list3r.frames.listing import DEPTH, POSE, POSE_FILE, FrameFile
 from list3r.frames.options import SourceOptions
@@ -56,7 +55,7 @@ NOWHERE_SURE = "the sensor is not sure of any depth that was sampled; does `conf
 NOT_STANDING = "the cameras do not stand upright in the poses' world: its vertical is not used"
 
 
-class FolderSource(Reader):
+class FolderSource(FrameSource):
     """A `FrameSource` over files; nothing is kept between frames."""
 
     def __init__(self, root: Path, layout: FolderLayout, options: SourceOptions) -> None:
@@ -88,7 +87,6 @@ class FolderSource(Reader):
         self._info = self._describe(root, notes)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
         for position in range(len(self._chosen))[start:stop:step]:
             yield self._read(self._number(position))
 
@@ -112,12 +110,7 @@ class FolderSource(Reader):
         except FrameError as error:
             return BadFrame(number, str(error))
 
-    def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
-        return self._chosen.position(index)
-
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of the colour camera of every frame that has one; no picture is decoded."""
         found = [(k, self._layout.files[k]) for k in map(self._number, range(len(self._chosen)))]
         poses = [(k, self._time_s(k, file), self._pose(file)) for k, file in found]
         return [(k, time_s, T) for k, time_s, T in poses if T is not None]
@@ -133,11 +126,13 @@ class FolderSource(Reader):
         raw = read_raw_depth(file.depth)
         return self._color(file), clean_depth(raw, self._rig.depth_scale, self._options.max_depth_m)
 
-    def read_gray(self, position: int, reduction: int) -> NDArray[np.uint8] | None:
-        """Return the colour image in grey as stored, each side reduced by 1, 2, 4 or 8.
+    def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
+        return map(partial(self._gray, reduction=8), range(len(self._chosen)))
 
-        None where it cannot be decoded.
-        """
+    def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
+        return map(self._gray, range(len(self._chosen))[start:stop])
+
+    def _gray(self, position: int, reduction: int = 1) -> NDArray[np.uint8] | None:
         try:
             return read_gray(self._layout.files[self._number(position)].color, reduction)
         except FrameError:
@@ -186,10 +181,7 @@ class FolderSource(Reader):
         least = self._layout.least_confidence
         if least is None or file.confidence is None:
             return raw
-        confidence = read_raw_depth(file.confidence)
-        if confidence.shape != raw.shape:
-            confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        return sure_depth(raw, confidence, least)
+        return sure_depth(raw, read_raw_depth(file.confidence), least)
 
     def _time_s(self, number: int, file: FrameFile) -> float:
         return file.time_s if self._clock and file.time_s is not None else number / self._fps
@@ -222,26 +214,32 @@ class FolderSource(Reader):
         reason = ""
         for file in chain(first, others if count < len(files) else ()):
             try:
-                color = read_color(file.color, upright=self._layout.upright_tags)
-                self._first_picture = file.color
-                self._bits = used_bits([f.color for f in paths])
-                if not self._has_depth:
-                    return color.shape[:2], None
-                if file.depth is not None:
-                    raw = read_raw_depth(file.depth)
-                    if raw.dtype == np.uint8:
-                        raise SourceError(
-                            f"{root}: depth images like {file.depth.name} have 8 bits, 255 steps, as pictures of depth "
-                            "for people have; export depth with 16 bits, or use --kind images on the pictures' folder "
-                            "to take colour alone"
-                        )
-                    self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
-                    return color.shape[:2], raw.shape
+                if found := self._sizes(root, file, [f.color for f in paths]):
+                    return found
             except FrameError as error:
                 reason = reason or str(error)
         raise SourceError(f"{root}: none of {len(tried)} frames tried can be decoded ({reason}); is the copy complete?")
 
-    def _shown_part(self, root: Path) -> Shown | None:
+    def _sizes(
+        self, root: Path, file: FrameFile, colors: list[Stored]
+    ) -> tuple[tuple[int, int], tuple[int, int] | None] | None:
+        """Image sizes of a frame, None for one without the depth that others have. Raises `FrameError`."""
+        color = read_color(file.color, upright=self._layout.upright_tags)
+        self._first_picture, self._bits = file.color, used_bits(colors)
+        if not self._has_depth:
+            return color.shape[:2], None
+        if file.depth is None:
+            return None
+        raw = read_raw_depth(file.depth)
+        if raw.dtype == np.uint8:
+            raise SourceError(
+                f"{root}: depth images like {file.depth.name} have 8 bits, 255 steps, as pictures of depth for people "
+                "have; export depth with 16 bits, or use --kind images on the pictures' folder to take colour alone"
+            )
+        self._typical_raw, self._floats = _median_known(raw), raw.dtype.kind == "f"
+        return color.shape[:2], (raw.shape[0], raw.shape[1])
+
+    def _shown_part(self, root: Path) -> ShownPart | None:
         """Return the part of pictures without depth that is no black bar. Raises `SourceError` for panoramas."""
         files, chosen = self._layout.files, self._chosen
         if (
@@ -389,7 +387,6 @@ class FolderSource(Reader):
         found = fingerprint(layout.kind, self._listing(root), self._options)
         notes = (*notes, *self._doubts())
         guess, turns = self._camera_guess(), self._turns()
-        missing = [*layout.missing, *missing_parts(depth=self._has_depth, camera=rig.camera is not None)]
         if rig.shown is not None:
             notes = (*notes, shown_note(rig.shown, rig.stored_size))
         if rig.color_size != rig.shown_size:
@@ -415,13 +412,11 @@ class FolderSource(Reader):
             camera=rig.camera,
             has_depth=self._has_depth,
             has_poses=has_poses,
-            scale_kind="metric" if self._has_depth else "relative",
             fingerprint=found,
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._has_depth else None,
             notes=(*layout.notes, *notes, *not_read_note(left)),
-            missing=tuple(missing),
             image_size=rig.color_size,
             stored_size=rig.shown_size,
             corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),

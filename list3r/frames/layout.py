@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.frames.files import MAX_LIST_BYTES, MAX_TEXT_BYTES, open_ordinary, read_file
 from list3r.frames.listing import FrameFiles
-from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
+from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics, intrinsics_of_matrix
 from list3r.memory.core.errors import OptionError, SourceError
 from list3r.memory.core.unpacking import parse_json
 
@@ -66,7 +66,6 @@ class FolderLayout:
     registered_intrinsics: Intrinsics | None = None
     """Colour camera to use when the user says that depth is registered after all, px."""
     notes: tuple[str, ...] = field(default=())
-    missing: tuple[str, ...] = field(default=())
     least_confidence: int | None = None
     """Depth whose confidence (0, 1, 2) is less than this is unknown; None where there is no confidence."""
     poses_metric: bool = True
@@ -106,6 +105,11 @@ def usual_camera(cameras: Sequence[Camera]) -> Camera:
     width, height = Counter((c.width, c.height) for c in cameras).most_common(1)[0][0]
     same = [(c.fx, c.fy, c.cx, c.cy) for c in cameras if (c.width, c.height) == (width, height)]
     return Camera(width, height, *np.median(np.array(same), axis=0).tolist())
+
+
+def there(path: Path) -> Path | None:
+    """Return the path of a file that is there, else None."""
+    return path if path.is_file() else None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -204,6 +208,14 @@ def read_calibration(root: Path) -> tuple[Intrinsics, tuple[float, ...]] | None:
         return check_intrinsics(values[:4]), check_distortion(values[4:]) if values[4:] else ()
     except OptionError as error:
         raise SourceError(f"{path}: {error}") from None
+
+
+def read_camera_matrix(path: Path) -> Intrinsics:
+    """fx, fy, cx, cy of a text file that holds a camera matrix. Raises `SourceError`."""
+    try:
+        return intrinsics_of_matrix([v for row in read_numbers(path) for v in row])
+    except OptionError as error:
+        raise SourceError(f"{path}: {error}; fix it, or give --intrinsics fx,fy,cx,cy") from None
 
 
 def inside(root: Path, name: str, stated_in: Path) -> Path:

@@ -160,6 +160,17 @@ def check_intrinsics(values: Sequence[float], name: str = "intrinsics") -> Intri
     return (float(values[0]), float(values[1]), float(values[2]), float(values[3]))
 
 
+def intrinsics_of_matrix(numbers: Sequence[float]) -> Intrinsics:
+    """fx, fy, cx, cy of a camera matrix of 9 or 16 numbers, row by row or column by column. Raises `OptionError`."""
+    side = {9: 3, 16: 4}.get(len(numbers))
+    if side is None:
+        raise OptionError(f"a camera matrix of {len(numbers)} numbers: give 3x3 or 4x4")
+    m = np.array(numbers, np.float64).reshape(side, side)
+    if not m[0, 2] and not m[1, 2]:
+        m = m.T
+    return check_intrinsics([float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2])])
+
+
 _MOST_DISTORTION = 100.0
 
 
@@ -217,19 +228,19 @@ def parse_transform(text: str, name: str = "depth to color", quaternion: Literal
     if words is None and _names_a_file(text):
         raise OptionError(f"{name} {text!r}: there is no such file, and it is not a row of numbers such as tx,ty,tz")
     v = np.array(parse_numbers(words or text, name))
-    matrix = np.eye(4)
-    if len(v) in (12, 16):
-        matrix[: len(v) // 4] = v.reshape(-1, 4)
-    elif len(v) in (3, 7):
-        matrix[:3, 3] = v[:3]
-        if len(v) == 7:
-            xyzw = v[3:] if quaternion == "xyzw" else np.roll(v[3:], -1)
-            if not abs(np.linalg.norm(xyzw) - 1.0) < 0.01:
-                raise OptionError(f"{name} {text!r}: the last four numbers must be a unit quaternion {quaternion}")
-            matrix[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
-    else:
+    if len(v) not in (3, 7, 12, 16):
         order = ",".join("q" + letter for letter in quaternion)
         raise OptionError(f"{name} {text!r}: give 16 numbers (4x4) or tx,ty,tz,{order}, not {len(v)}")
+    matrix = np.eye(4)
+    if len(v) >= 12:
+        matrix[: len(v) // 4] = v.reshape(-1, 4)
+    else:
+        matrix[:3, 3] = v[:3]
+    if len(v) == 7:
+        xyzw = v[3:] if quaternion == "xyzw" else np.roll(v[3:], -1)
+        if not abs(np.linalg.norm(xyzw) - 1.0) < 0.01:
+            raise OptionError(f"{name} {text!r}: the last four numbers must be a unit quaternion {quaternion}")
+        matrix[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
     return tuple(tuple(float(x) for x in row) for row in check_rigid(matrix, name))
 
 

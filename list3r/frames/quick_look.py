@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-
-import numpy as np
-
-from list3r.frames.base import BadFrame, Frame, FrameSource
+from list3r.frames.base import FrameSource
 
 _SPOTS = 24
 """Places of a source that are looked at."""
@@ -17,8 +13,7 @@ def unusable(source: FrameSource) -> tuple[str, ...]:
 
     A video is decoded for some frames from each of its places, another source is read at each of them.
     """
-    own = getattr(source, "look", None)
-    looked = sorted(_read(source) if own is None else own(_SPOTS))
+    looked = sorted(source.look(_SPOTS))
     bad = [(number, reason) for number, reason in looked if reason]
     if not bad:
         return ()
@@ -31,17 +26,3 @@ def unusable(source: FrameSource) -> tuple[str, ...]:
     elif len(looked) - sound > 2:
         where += f", and all of these from frame {looked[sound + 1][0]} on"
     return (f"{len(bad)} of {len(looked)} {some} cannot be used: {where}",)
-
-
-def outcomes(frames: Iterable[Frame | BadFrame]) -> Iterator[tuple[int, str]]:
-    """Yield the number of each frame and why it cannot be used, empty where it can."""
-    for frame in frames:
-        yield frame.index, frame.reason if isinstance(frame, BadFrame) else ""
-
-
-def _read(source: FrameSource) -> Iterator[tuple[int, str]]:
-    """Look at frames at steps that are not even, which miss no pattern."""
-    places = np.linspace(0, 1, min(_SPOTS, source.info.frame_count))
-    bent = places if len(places) < _SPOTS else places**1.1
-    for position in np.unique((bent * (source.info.frame_count - 1)).round().astype(int)).tolist():
-        yield from outcomes(source.read(position, position + 1))

@@ -7,18 +7,16 @@ it, and nothing asks the network again.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import socket
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlparse
 from urllib.request import getproxies
 
-from list3r.memory.core.errors import OptionError, install_hint
-from list3r.models.cards import UNPINNED, Weights
+from list3r.memory.core.errors import OptionError, first_line, install_hint
+from list3r.models.cards import OTHER, UNPINNED, Weights
 
 CONFIG = "config.json"
 SINGLE_FILES = (".safetensors", ".pt", ".pth", ".bin")
@@ -26,7 +24,6 @@ OLD_FILES = ("*.bin", "*.pt", "*.pth")
 """Fetched only where there is nothing newer; read without running their code."""
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_MAX_HEADER = 100 * 2**20
 
 NO_NETWORK = (
     "the hub cannot be reached, and the cache has no copy; run `list3r models fetch {name}` where there is a network, "
@@ -89,7 +86,7 @@ def resolve(asked: str | None, weights: Weights | None, option: str) -> str:
         return str(_own(Path(asked).expanduser(), option).resolve())
     if asked is not None:
         repository, revision = split_name(asked) or (asked, UNPINNED)
-        known = weights if weights is not None and weights.repository == repository else Weights(repository, _unknown())
+        known = weights if weights is not None and weights.repository == repository else Weights(repository, OTHER)
         wanted = revision if "@" in asked else known.revision
     elif weights is not None:
         known, wanted = weights, weights.revision
@@ -153,30 +150,21 @@ def check_weights(path: Path) -> None:
         raise OptionError(f"{path} holds no weights ({', '.join(SINGLE_FILES)})")
     for file in files:
         if file.suffix == ".safetensors":
-            read_header(file)
+            _check_tensors(file)
         elif file.stat().st_size < 1024:
             raise OptionError(f"{file} is {file.stat().st_size} bytes long and not a checkpoint; fetch it again")
 
 
-def read_header(file: Path) -> dict[str, Any]:
-    """Return the table of contents of a `.safetensors` file.
+def _check_tensors(file: Path) -> None:
+    from safetensors import SafetensorError, safe_open
 
-    Raises `OptionError` when the file is not as long as it says.
-    """
-    size = file.stat().st_size
-    with file.open("rb") as stream:
-        length = int.from_bytes(stream.read(8), "little")
-        if size < 8 or length > min(size - 8, _MAX_HEADER):
-            raise OptionError(f"{file} is not a .safetensors file, or is cut off; fetch it again")
-        try:
-            header: dict[str, Any] = json.loads(stream.read(length))
-            ends = [int(entry["data_offsets"][1]) for key, entry in header.items() if key != "__metadata__"]
-        except (ValueError, TypeError, KeyError, IndexError):
-            raise OptionError(f"{file} has a damaged table of contents; fetch it again") from None
-    expected = 8 + length + max(ends, default=0)
-    if size != expected:
-        raise OptionError(f"{file} is {size} bytes long instead of {expected}: it is cut off; fetch it again")
-    return {k: v for k, v in header.items() if k != "__metadata__"}
+    try:
+        with safe_open(file, framework="np"):
+            return
+    except (SafetensorError, OSError) as error:
+        raise OptionError(
+            f"{file} is no .safetensors file, cut off or damaged ({first_line(error)}); fetch it again"
+        ) from None
 
 
 def _own(path: Path, option: str) -> Path:
@@ -185,12 +173,6 @@ def _own(path: Path, option: str) -> Path:
             f"--weights {path}: no such file or folder, and not a repository such as owner/name; {option} needs one"
         )
     return path
-
-
-def _unknown() -> Any:
-    from list3r.models.cards import OTHER
-
-    return OTHER
 
 
 def _is_known(endpoint: str) -> bool:

@@ -94,7 +94,7 @@ def _scale_kind(info: SourceInfo, settings: BuildSettings) -> str:
     source = _scale_source(info, settings)
     if source == "given poses":
         return "metric" if info.poses_metric else "relative"
-    return "relative" if source == "none" else info.scale_kind
+    return "relative" if source == "none" else "metric"
 
 
 def _scale_source(info: SourceInfo, settings: BuildSettings) -> str:

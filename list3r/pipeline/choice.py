@@ -8,7 +8,6 @@ from pathlib import Path
 
 from list3r.frames.base import SourceInfo
 from list3r.frames.chunking.chunks import ChunkSettings
-from list3r.instances.registry import DISCOVERERS
 from list3r.memory.core.errors import OptionError
 from list3r.memory.library.world.held import parse_up
 from list3r.memory.store.store import Store
@@ -71,11 +70,6 @@ def settings_resumed(
         named, notes = _models_asked(request, info, licence)
         settings = replace(settings, **{name: getattr(named, name) for name in MODEL_CHOICES})
         settings = replace(settings, frame_look=_look_beside(settings.features, begun))
-    if settings.discovery not in DISCOVERERS:
-        raise OptionError(
-            f"this session was begun with --discovery {settings.discovery}, which this version does not have; "
-            "continue with --discovery learned"
-        )
     asked = begun.association if request.association is None else AssociationSettings.by_method(request.association)
     if asked != begun.association:
         raise OptionError(f"this build was not begun with --association {request.association}; leave it out")

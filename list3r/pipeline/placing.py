@@ -106,9 +106,8 @@ def _place_blank(store: Store, blank: Collection[int]) -> None:
         rows = store.chunks.all(session.session_id)
         near = next((c for c in rows if c.chunk_id not in blank), None)
         for row in rows:
-            if row.chunk_id not in blank:
-                near = row
-            elif near is not None:
+            near = near if row.chunk_id in blank else row
+            if row.chunk_id in blank and near is not None:
                 beside[row.chunk_id] = near
     poses = {k: c.S_world_chunk for k, c in beside.items()}
     store.chunks.place(poses, {k: c.component for k, c in beside.items()})

@@ -326,9 +326,8 @@ def settled_step(store: Store, session: int, job: Job, watch: Watch) -> int:
     if known is None:
         known = job.settings.depth_every
         if known is None:
-            begun = store.chunks.all(session)  # by a version that took all frames
-            source, length = job.frames(), job.settings.chunks.length
-            known = 1 if begun else depth_step(source, length, _pace(job), progress=watch.looking("pace"))
+            length, looking = job.settings.chunks.length, watch.looking("pace")
+            known = depth_step(job.frames(), length, _pace(job), progress=looking)
         with store.transaction():
             store.sessions.put(replace(store.sessions.get(session), depth_step=known))
     return known
@@ -358,9 +357,7 @@ def _cuts(store: Store, session: int, job: Job, watch: Watch) -> tuple[int, ...]
         return ()
     known = store.sessions.get(session).cuts
     if known is None:
-        begun = store.chunks.all(session)  # by a version that did not look for any
-        scan = watch.looking("cuts")
-        known = () if begun else tuple(find_cuts(job.frames(), job.settings.cuts, scan))
+        known = tuple(find_cuts(job.frames(), job.settings.cuts, watch.looking("cuts")))
         with store.transaction():
             store.sessions.put(replace(store.sessions.get(session), cuts=known))
     return known

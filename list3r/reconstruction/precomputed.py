@@ -19,10 +19,10 @@ from list3r.memory.core.errors import DegenerateError, OptionError, TrackingErro
 from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.feedforward.output import WindowOutput, to_reconstruction, with_given_poses
-from list3r.reconstruction.feedforward.settings import NetworkSettings
 from list3r.reconstruction.feedforward.windows import between, regauged
 from list3r.reconstruction.precomputed_files import Manifest, read_frames, read_manifest, read_piece
 from list3r.reconstruction.registry import ModelOptions
+from list3r.reconstruction.settings import NetworkSettings
 
 
 def make(options: ModelOptions) -> PrecomputedReconstructor:

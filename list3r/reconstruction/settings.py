@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from list3r.memory.core.masks import FULL_SIDE_PX
-from list3r.reconstruction.base import SensorNoise
+from list3r.reconstruction.base import KeyframeSpacing, SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.feedforward.settings import NetworkSettings
 from list3r.reconstruction.rgbd.settings import RgbdSettings
 from list3r.reconstruction.sfm.settings import SfmSettings
 
@@ -49,6 +48,17 @@ class SampleSettings:
     """Share of the picture up to which a mask counts as small."""
     resolution_bits: int = 15
     """Points are rounded to 2^-bits of their extent (0.2 mm in 6 m), so that they compress."""
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """How the output of a network becomes a chunk."""
+
+    edge_step: float = 0.03
+    """Depth step between neighbours that makes an edge, as a share of depth (the examples of pi3's authors)."""
+    edge_confidence: float = 0.1
+    """Factor of the confidence next to an edge, where a network smears one surface into the next."""
+    keyframes: KeyframeSpacing = field(default_factory=KeyframeSpacing)
 
 
 @dataclass(frozen=True)

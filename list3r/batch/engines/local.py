@@ -24,11 +24,9 @@ class LocalEngine:
         self._pool = TaskPool(run_task, self.window, self._environment)
 
     def submit(self, job: BatchJob) -> None:
-        """Take a task."""
         self._pool.submit(job)
 
     def as_completed(self) -> Iterator[Outcome]:
-        """Yield tasks as they end, until none is left."""
         for job, result in self._pool.as_completed():
             if isinstance(result, Outcome):
                 yield result
@@ -36,7 +34,6 @@ class LocalEngine:
                 yield Outcome(job.task, "lost", f"{type(result).__name__}: {result}".splitlines()[0])
 
     def cancel(self) -> None:
-        """End all tasks at once."""
         self._pool.cancel()
 
     def _environment(self, place: int) -> Mapping[str, str]:

@@ -33,11 +33,9 @@ class RayEngine:
         self._open: dict[Any, BatchJob] = {}
 
     def submit(self, job: BatchJob) -> None:
-        """Take a task."""
         self._open[self._submit(job)] = job
 
     def as_completed(self) -> Iterator[Outcome]:
-        """Yield tasks as they end, until none is left."""
         while self._open:
             done = self._cluster.first(list(self._open))
             job = self._open.pop(done)
@@ -49,6 +47,5 @@ class RayEngine:
             yield outcome
 
     def cancel(self) -> None:
-        """End all tasks at once, and the cluster where this engine started or joined it."""
         self._cluster.leave(list(self._open))
         self._open.clear()

@@ -89,9 +89,7 @@ def _given(path: Path) -> Trajectory:
     from list3r.frames.source import open_source
     from list3r.memory.core.errors import OptionError
 
-    source = open_source(path)
-    read = getattr(source, "read_poses", None)
-    poses = [] if read is None else read()
+    poses = open_source(path).read_poses()
     if not poses:
         raise OptionError(
             f"{path} has no poses; give a trajectory file (TUM, EuRoC, KITTI), a memory, or a source with poses"

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -112,10 +111,7 @@ def frames_around(
 
 def _thinned(source: FrameSource, start: int, stop: int, step: int) -> list[Frame]:
     """Return the frames at positions start, start + step, ... before `stop` that can be decoded."""
-    thinned = getattr(source, "read_every", None)
-    if start >= stop:
-        return []
-    found = thinned(start, stop, step) if thinned else islice(source.read(start, stop), 0, None, step)
+    found = source.read_every(start, stop, step) if start < stop else ()
     return [frame for frame in found if not isinstance(frame, BadFrame)]
 
 

@@ -8,16 +8,14 @@ One spoilt frame (black, flash, blur) is looked past.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import Frame, FrameSource
-from list3r.frames.decoding.picture import gray_of
+from list3r.frames.base import FrameSource
 
 Floats = NDArray[np.float32]
 Gray = NDArray[np.uint8]
@@ -49,25 +47,6 @@ class ShotCutSettings:
     frames give up to 12 by chance."""
     agreeing_share: float = 0.12
     """The same as a share of the matches that agree between neighbours on either side, if that is more."""
-
-
-class ThumbnailSource(FrameSource, Protocol):
-    """A source that can decode grey pictures for less than whole frames: by `read_gray`, or by the other two."""
-
-    def read_gray(self, position: int, reduction: int) -> Gray | None:
-        """Return the colour image in grey, each side reduced by about `reduction` (1, 2, 4 or 8).
-
-        None where it is bad.
-        """
-        ...
-
-    def thumbnails(self) -> Iterator[Gray | None]:
-        """Small grey pictures of all frames in order, in one pass; None where a frame is bad."""
-        ...
-
-    def read_grays(self, start: int, stop: int) -> Iterator[Gray | None]:
-        """Grey pictures at positions [start, stop), large enough for local features; None where a frame is bad."""
-        ...
 
 
 Progress = Callable[[int, int], None]
@@ -103,7 +82,7 @@ def find_cuts(
     reach = max(chosen.look_past, chosen.least_shot) + 1
     delay = max(chosen.window, reach)
     last: Gray | None = None
-    for k, thumbnail in enumerate(_thumbnails(source, count)):
+    for k, thumbnail in enumerate(map(_small, source.thumbnails())):
         if thumbnail is not None:
             likeness[k] = 1.0 if last is None else _thumbnail_likeness(last, thumbnail)
             around[k] = last = thumbnail
@@ -153,18 +132,6 @@ def spaced(cuts: Sequence[int], alike: Alike, settings: ShotCutSettings) -> tupl
 
 
 # ---------------------------------------------------------------------------------------------- pictures
-
-
-def _thumbnails(source: FrameSource, count: int) -> Iterator[Gray | None]:
-    """Small grey pictures of all frames, 48 wide; None where a frame is bad."""
-    thumbnails = getattr(source, "thumbnails", None)
-    read_gray = getattr(source, "read_gray", None)
-    if thumbnails is not None:
-        yield from map(_small, thumbnails())
-    elif read_gray is not None:
-        yield from (_small(read_gray(k, 8)) for k in range(count))
-    else:
-        yield from (_small(gray_of(f)) if isinstance(f, Frame) else None for f in source.read(0, count))
 
 
 def _small(gray: Gray | None) -> Gray | None:
@@ -258,19 +225,9 @@ class _Looks:
         return self._known[position]
 
     def _gray(self, position: int) -> Gray | None:
-        read_gray = getattr(self._source, "read_gray", None)
-        if read_gray is not None:
-            found: Gray | None = read_gray(position, 1)
-            return found
         if position not in self._grays:
             # A video decodes from a key frame on, so the neighbours that will be asked for next come with it.
             first, last = max(0, position - _AHEAD), min(self._count, position + _AHEAD)
-            self._grays = dict(enumerate(self._read_grays(first, max(last, position + 1)), first))
+            grays = self._source.read_grays(first, max(last, position + 1))
+            self._grays = dict(enumerate(grays, first))
         return self._grays.get(position)
-
-    def _read_grays(self, first: int, stop: int) -> Iterator[Gray | None]:
-        """Grey pictures at positions [first, stop), None where a frame is bad."""
-        read_grays = getattr(self._source, "read_grays", None)
-        if read_grays is not None:
-            return iter(read_grays(first, stop))
-        return (gray_of(f) if isinstance(f, Frame) else None for f in self._source.read(first, stop))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.files import MAX_PIXELS, read_file, too_many_pixels
+from list3r.frames.files import MAX_PIXELS, jpeg_segments, read_file, too_many_pixels
 from list3r.frames.recordings.exr import read_exr
 from list3r.frames.recordings.stored import CodedArray, Stored
 from list3r.memory.core.errors import FrameError
@@ -84,6 +84,8 @@ def read_raw_depth(path: Stored | CodedArray) -> NDArray[Any]:
 
 def sure_depth(raw: NDArray[Any], confidence: NDArray[Any], least: int) -> NDArray[Any]:
     """Return depth as stored, 0 where ARKit was less sure than `least` (0, 1, 2; some apps store 0, 127, 255)."""
+    if confidence.shape != raw.shape:
+        confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     levels = confidence if confidence.max(initial=0) <= 2 else np.rint(confidence / 127.5)
     return np.where(levels >= least, raw, np.zeros((), raw.dtype))
 
@@ -158,7 +160,10 @@ def _fault(data: bytes) -> str:
     """
     if data.startswith(b"\x89PNG"):
         return _png_fault(data)
-    return "cut off" if data.startswith(b"\xff\xd8") and data.find(b"\xff\xd9", _scan_start(data)) < 0 else ""
+    if not data.startswith(b"\xff\xd8"):
+        return ""
+    *_, (_, start) = jpeg_segments(data)  # what lies before the scan may hold a whole small picture
+    return "" if data.find(b"\xff\xd9", start) >= 0 else "cut off"
 
 
 def _png_fault(data: bytes) -> str:
@@ -174,15 +179,6 @@ def _png_fault(data: bytes) -> str:
             return ""
         at = end
     return "cut off"
-
-
-def _scan_start(data: bytes) -> int:
-    """Where the first scan of a JPEG begins: what lies before may hold a whole small picture (ITU-T T.81, annex B)."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        alone = data[at + 1] in (0x01, 0xFF) or 0xD0 <= data[at + 1] <= 0xD8  # markers without a segment, and filling
-        at += (1 if data[at + 1] == 0xFF else 2) if alone else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return at
 
 
 def _bytes(stored: Stored) -> bytes:

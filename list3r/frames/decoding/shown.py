@@ -25,7 +25,7 @@ LOOKED_AT = 9
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownPart:
     """The part of a picture that shows something, px."""
 
     top: int
@@ -40,7 +40,7 @@ class Shown:
         return self.bottom - self.top, self.right - self.left
 
 
-def shown_part(pictures: Iterable[NDArray[np.uint8]]) -> Shown | None:
+def shown_part(pictures: Iterable[NDArray[np.uint8]]) -> ShownPart | None:
     """Return the part without black bars of pictures of one size, None where they have none. Shapes (H, W, 3).
 
     A bar is black in every picture, ends at one line, and has a like one on the other side. Pictures after the first
@@ -57,7 +57,7 @@ def shown_part(pictures: Iterable[NDArray[np.uint8]]) -> Shown | None:
     if brightest is None:
         return None
     (height, width), vertical, horizontal = brightest.shape, _sure(brightest, 0), _sure(brightest, 1)
-    found = Shown(vertical[0], horizontal[0], height - vertical[1], width - horizontal[1])
+    found = ShownPart(vertical[0], horizontal[0], height - vertical[1], width - horizontal[1])
     return None if found.size == (height, width) or min(found.size) < 2 * _STRIP_PX else found
 
 
@@ -90,7 +90,7 @@ def _begin(lines: NDArray[np.uint8]) -> int | None:
     return int(seen.argmax()) if seen.any() else None
 
 
-def shown_note(shown: Shown, size: tuple[int, int]) -> str:
+def shown_note(shown: ShownPart, size: tuple[int, int]) -> str:
     """That bars are cut off, for people; `size` (height, width) is that of the pictures with them."""
     height, width = shown.size
     return (

@@ -124,20 +124,25 @@ def _listed(path: Path, words: dict[str, str]) -> tuple[VideoTimestamps, float]:
             raise SourceError(
                 f"{path} holds depth and no colour; give the recording that holds both, or a colour video"
             )
-        numbers, hidden, trimmed = array("q"), array("q"), 0
-        for packet in packets(container, stream):  # none is kept: together they are the file
-            if packet.size and not packet.is_discard:
-                stated = (_NONE if stamp is None else stamp for stamp in (packet.pts, packet.dts))
-                numbers.extend((*stated, bool(packet.is_keyframe)))
-            elif packet.size:
-                trimmed += 1
-                hidden.extend(() if packet.pts is None else (packet.pts,))
-        rows = np.frombuffer(numbers, np.int64).reshape(-1, 3)
+        rows, hidden, trimmed = _counted(container, stream)
         stamps = _stamps(path, rows, container, stream)
         notes = (*stamps.notes, *_breaks_off(rows, trimmed, container, stream))
         earlier = stamps.clock and bool(hidden) and max(hidden) < stamps.stamps[0]
         hidden_s = float(int(stamps.stamps[0] - min(hidden)) * stamps.unit) if earlier else 0.0
         return replace(stamps, words=words, notes=notes), hidden_s
+
+
+def _counted(container: Any, stream: Any) -> tuple[_Rows, array[int], int]:
+    """Rows of the packets that are shown; the stamps of those that are not, and how many these are."""
+    numbers, hidden, trimmed = array("q"), array("q"), 0
+    for packet in packets(container, stream):  # none is kept: together they are the file
+        if packet.size and not packet.is_discard:
+            stated = (_NONE if stamp is None else stamp for stamp in (packet.pts, packet.dts))
+            numbers.extend((*stated, bool(packet.is_keyframe)))
+        elif packet.size:
+            trimmed += 1
+            hidden.extend(() if packet.pts is None else (packet.pts,))
+    return np.frombuffer(numbers, np.int64).reshape(-1, 3), hidden, trimmed
 
 
 def open_container(path: Path, words: dict[str, str]) -> Any:

@@ -25,7 +25,6 @@ class FolderFeed:
         self._looked = 0.0
 
     def state(self) -> FeedState:
-        """What has come so far; the folder is looked at."""
         now = time.monotonic()
         if self._state.ended or now - self._looked < self._settings.poll_s:
             return self._state
@@ -46,16 +45,13 @@ class FolderFeed:
         return self._state
 
     def admit(self) -> bool:
-        """Frames of a folder do not wait to be let in."""
         return False
 
     def hold(self, frames: int) -> None:
         """Nothing is dropped from a folder."""
 
     def arrived_s(self, position: int) -> float:
-        """When a frame was found, seconds of `time.monotonic`."""
         return self._arrived[position]
 
     def close(self) -> None:
-        """End it; nothing more comes."""
         self._state = replace(self._state, ended=True, reason="stopped here")

@@ -20,7 +20,8 @@ from list3r.frames.live.camera import LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.usbmux import connect, receive
 from list3r.frames.readers.phones.record3d import METADATA, MOST_DEPTH_PIXELS
-from list3r.memory.core.errors import OptionError, SourceError, install_hint
+from list3r.frames.recordings.stored import import_lzfse
+from list3r.memory.core.errors import SourceError
 
 PORT = 1337
 _VARIES = 0.01
@@ -60,12 +61,7 @@ class Record3dPhone:
 
     def __init__(self, serial: str, tell: Tell) -> None:
         """The phone of a serial number, or the only one. Raises `OptionError` without the extra."""
-        try:
-            import lzfse  # noqa: F401
-        except ImportError:
-            raise OptionError(
-                f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
-            ) from None
+        import_lzfse()
         self._serial, self._tell = serial, tell
         self._first: _PhoneFrame | None = None
         self._noted = set[str]()

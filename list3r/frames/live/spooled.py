@@ -52,17 +52,14 @@ class StreamFeed:
         self._thread.start()
 
     def state(self) -> FeedState:
-        """What has come so far."""
         with self._lock:
             return self._state
 
     def hold(self, frames: int) -> None:
-        """Say how many frames may wait, unless the settings do."""
         with self._lock:
             self._most = self._settings.most_waiting or frames
 
     def admit(self) -> bool:
-        """Let in the frames that wait, because nothing is left to do; whether there were any."""
         with self._lock, (self.folder / LIST).open("a", encoding="ascii") as file:
             before = self._state
             cuts, begun_s = before.cuts, (self._arrived or [w.came_s for w in self._waiting] or [0.0])[0]
@@ -75,11 +72,9 @@ class StreamFeed:
             return self._state.count > before.count
 
     def arrived_s(self, position: int) -> float:
-        """When a frame came, seconds of `time.monotonic`."""
         return self._arrived[position]
 
     def close(self) -> None:
-        """End it; nothing more comes."""
         self._stop.set()
         self._thread.join(2 * self._settings.silence_s)
 

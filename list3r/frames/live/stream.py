@@ -14,7 +14,7 @@ from list3r.frames.live.addresses import DEVICES, is_phone, without_secrets
 from list3r.frames.live.camera import LiveCamera, LivePicture, LostError
 from list3r.frames.live.feed import Tell
 from list3r.frames.live.record3d import Record3dPhone
-from list3r.frames.writers.pictures import jpeg
+from list3r.frames.writers.base import jpeg
 from list3r.memory.core.errors import OptionError, SourceError
 
 
@@ -35,7 +35,6 @@ class NetworkStream:
         self._source, self.name = source, without_secrets(source)
 
     def pictures(self, folder: Path, silence_s: float) -> Iterator[LivePicture]:
-        """The pictures of one connection, compressed where they are kept. Raises `LostError`, `SourceError`."""
         wait = {"rw_timeout": str(int(1e6 * silence_s)), "fflags": "nobuffer"}
         kind = "v4l2" if self._source.startswith(DEVICES) else None
         words = {} if kind else wait | ({"rtsp_transport": "tcp"} if self._source.startswith("rtsp") else {})

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo
 from list3r.frames.decoding.decode import clean_depth
 from list3r.frames.folder import fingerprint
 from list3r.frames.options import SourceOptions
@@ -52,7 +52,7 @@ def _video(root: Path) -> Path | None:
     return (usual or found)[0] if usual or len(found) == 1 else None
 
 
-class AriaSource(Reader):
+class AriaSource(FrameSource):
     """A `FrameSource` over one recording; nothing but its clock and its poses is kept."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:
@@ -87,7 +87,6 @@ class AriaSource(Reader):
         self._info = self._describe(root, tuple(notes), moved)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on; the others are not decoded."""
         color = _opened(self._path, COLOR)
         depth = None if self._depth_path is None else _opened(self._depth_path, DEPTH)
         for k in range(len(self._chosen))[start:stop:step]:
@@ -97,12 +96,7 @@ class AriaSource(Reader):
             except FrameError as error:
                 yield BadFrame(number, str(error))
 
-    def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
-        return self._chosen.position(index)
-
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
         numbers = [int(n) for n in self._chosen.starts]
         return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
 
@@ -126,11 +120,9 @@ class AriaSource(Reader):
             camera=self._view.camera,
             has_depth=has_depth,
             has_poses=any(T is not None for T in self._poses),
-            scale_kind="metric" if has_depth else "relative",
             fingerprint=fingerprint("aria", listing, self._options),
             depth_scale=(self._options.depth_scale or _MILLIMETRES) if has_depth else None,
             notes=notes,
-            missing=tuple(missing_parts(depth=has_depth, camera=True)),
             image_size=(self._view.camera.height, self._view.camera.width),
             z_up=moved is not None and moved.upright,
             poses_drift=moved is not None and moved.drifts,

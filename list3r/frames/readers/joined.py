@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader
+from list3r.frames.base import BadFrame, Frame, FrameSource
 from list3r.frames.options import SourceOptions
 from list3r.frames.readers.video import VideoSource
 from list3r.memory.core.errors import OptionError, SourceError
 
 
-class JoinedVideos(Reader):
+class JoinedVideos(FrameSource):
     """A `FrameSource` over files in the order given; frames are numbered and timed as if they were one file."""
 
     def __init__(self, paths: Sequence[Path], options: SourceOptions) -> None:
@@ -46,30 +46,25 @@ class JoinedVideos(Reader):
         )
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         for k, first, last in self._within(start, stop):
             begin = first + -(first + self._positions[k] - start) % step
             for frame in self._parts[k].read_every(begin, last, step):
                 yield self._of_all(k, frame)
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
         k = min(max(0, bisect_right(self._numbers, index) - 1), len(self._parts) - 1)
         return int(self._positions[k]) + self._parts[k].position(index - self._numbers[k])
 
     def look(self, spots: int) -> Iterator[tuple[int, str]]:
-        """As `VideoSource.look`, with the spots shared among the files."""
         for part, before in zip(self._parts, self._numbers, strict=False):
             for number, reason in part.look(-(-spots // len(self._parts))):
                 yield number + before, reason
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
-        """Small grey pictures of all frames handed out, None for one that is damaged."""
         for part in self._parts:
             yield from part.thumbnails()
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures at positions [start, stop), None for one that is damaged."""
         for k, first, last in self._within(start, stop):
             yield from self._parts[k].read_grays(first, last)
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFiles
 from list3r.frames.options import SourceOptions
@@ -36,7 +36,7 @@ def is_dataset(root: Path) -> bool:
     return (root / INFO).is_file() and ((root / "data").is_dir() or (root / "videos").is_dir())
 
 
-class LeRobotSource(Reader):
+class LeRobotSource(FrameSource):
     """A `FrameSource`: the pictures of one camera in one episode, numbered from 0, with depth where a key has it."""
 
     def __init__(self, root: Path, options: SourceOptions) -> None:
@@ -69,7 +69,6 @@ class LeRobotSource(Reader):
         self._info = self._describe(root, options, episode, tuple(notes))
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         depths: Iterator[tuple[int, NDArray[np.float32] | None]] | None = None
         for frame in self._video.read_every(start, stop, step):
             number = frame.index - self._first
@@ -86,15 +85,12 @@ class LeRobotSource(Reader):
             yield self._with_depth(frame, raw)
 
     def position(self, index: int) -> int:
-        """Return where a frame (Frame.index) is among those handed out."""
         return self._video.position(index + self._first)
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
-        """Small grey pictures of all frames handed out, None for one that is damaged."""
         return self._video.thumbnails()
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures at positions [start, stop), None for one that is damaged."""
         return self._video.read_grays(start, stop)
 
     def _with_depth(self, frame: Frame, raw: NDArray[np.float32] | None) -> Frame | BadFrame:
@@ -114,13 +110,11 @@ class LeRobotSource(Reader):
             kind="lerobot",
             path=str(root),
             has_depth=has_depth,
-            scale_kind="metric" if has_depth else "relative",
             fingerprint=hashlib.sha256(print_.encode()).hexdigest()[:32],
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=self._rig.depth_scale if has_depth else None,
             notes=(*info.notes, *notes),
-            missing=tuple(missing_parts(depth=has_depth, camera=info.camera is not None)),
         )
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Listing, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, Listing, SourceInfo
 from list3r.frames.beside import role_of
 from list3r.frames.files import check_ordinary
 from list3r.frames.folder import fingerprint, without_pose
@@ -39,6 +39,7 @@ _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TF = "tf2_msgs/msg/TFMessage"
 _INFO = "sensor_msgs/msg/CameraInfo"
+_UNITS = "/option/Depth_Units/value"
 _REPORTED_EVERY = 200
 """Messages after which whoever watches hears of the listing."""
 _PACKED = ".zstd"
@@ -81,7 +82,7 @@ class Stream:
     """The first message."""
 
 
-class BagSource(Reader):
+class BagSource(FrameSource):
     """A `FrameSource` over one recording; nothing but its index is kept."""
 
     def __init__(self, path: Path, options: SourceOptions, listing: Listing | None = None) -> None:
@@ -127,7 +128,6 @@ class BagSource(Reader):
         self._info = replace(self._describe(tuple(notes), posed > 0), poses_drift=world == DRIFTING)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         numbers = [int(self._chosen.starts[k]) for k in range(len(self._chosen))[start:stop:step]]
         if not numbers:
             return
@@ -156,12 +156,7 @@ class BagSource(Reader):
         for number in [] if due is None else [due, *upcoming]:
             yield BadFrame(number, "its messages are missing from the recording")
 
-    def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
-        return self._chosen.position(index)
-
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
         numbers = [int(n) for n in self._chosen.starts]
         return [(n, float(self._times_s[n]), T) for n in numbers if (T := self._poses[n]) is not None]
 
@@ -194,7 +189,6 @@ class BagSource(Reader):
         rig, separate = self._rig, self._rig.registration
         files = [self._path] if self._path.is_file() else sorted(p for p in self._path.iterdir() if p.is_file())
         listing = [(p.name, p.stat().st_size) for p in files]
-        missing = missing_parts(depth=self._depth is not None, camera=rig.camera is not None)
         gaps = np.diff(self._times_s)
         return SourceInfo(
             kind="rosbag",
@@ -204,13 +198,11 @@ class BagSource(Reader):
             camera=rig.camera,
             has_depth=self._depth is not None,
             has_poses=has_poses,
-            scale_kind="metric" if self._depth is not None else "relative",
             fingerprint=fingerprint("rosbag", listing, self._options),
             depth_camera=separate.depth_camera if separate else None,
             T_color_depth=separate.T_color_depth if separate else None,
             depth_scale=rig.depth_scale if self._depth is not None else None,
             notes=notes,
-            missing=tuple(missing),
             image_size=rig.color_size,
         )
 
@@ -266,7 +258,10 @@ class _Topics:
                 f"--topics pose={pose} is {self._of[pose].msgtype}; poses are of {kinds}, or of /tf without it"
             )
         self._pose_topic = wanted.get("pose") or self._only_pose_topic()
-        self._streams, self._tree, self._infos, self._units = self._scan()
+        self._tree, self._infos = TransformTree(), dict[str, Any]()
+        self._units: dict[str, float] = {}
+        """Metres of a unit of depth, by the sensor's topics' beginning."""
+        self._streams = self._scan()
 
     def color(self) -> Stream:
         """The pictures. Raises `SourceError` where none or several would fit."""
@@ -299,7 +294,7 @@ class _Topics:
         intrinsics, lens, size = self._camera(color)
         if depth is None:
             return Optics(intrinsics, lens, intrinsics_size=size), notes
-        units = 1.0 if read_depth(depth.first).dtype.kind == "f" else 1.0 / self._units.get(depth.topic, 0.001)
+        units = 1.0 if read_depth(depth.first).dtype.kind == "f" else 1.0 / self._unit_m(depth.topic)
         if "aligned_depth" in depth.topic or depth.frame == color.frame:
             return Optics(intrinsics, lens, depth_scale=units, intrinsics_size=size), notes
         depth_intrinsics, _, depth_size = self._camera(depth)
@@ -307,6 +302,9 @@ class _Topics:
         if T_color_depth is not None:
             notes.append("the pose of the depth camera is from /tf_static")
         return Optics(intrinsics, lens, depth_intrinsics, T_color_depth, units, size, depth_size), notes
+
+    def _unit_m(self, topic: str) -> float:
+        return next((unit for sensor, unit in self._units.items() if topic.startswith(sensor)), 0.001)
 
     def _camera(self, stream: Stream) -> tuple[Any, tuple[float, ...], tuple[int, int] | None]:
         base = stream.topic.removesuffix("/compressed").removesuffix("/compressedDepth")
@@ -353,50 +351,46 @@ class _Topics:
         some = [f"{t} ({self._of[t].msgtype.rsplit('/', 1)[-1]})" for t in sorted(topics)[:_NAMED]]
         return ", ".join(some) + (f" and {len(topics) - _NAMED} more" if len(topics) > _NAMED else "")
 
-    def _scan(self) -> tuple[dict[str, Stream], TransformTree, dict[str, Any], dict[str, float]]:
+    def _scan(self) -> dict[str, Stream]:
         """One pass: times of pictures, transforms, cameras; of pictures the headers alone are read."""
         stamps: dict[str, list[tuple[float, int]]] = {}
         first: dict[str, Any] = {}
-        infos: dict[str, Any] = {}
-        units: dict[str, float] = {}
-        tree = TransformTree()
-        pose_topic = self._pose_topic
-        looked_at = [c for c in self._reader.connections if self._is_read(c.topic, c.msgtype, pose_topic)]
+        looked_at = [c for c in self._reader.connections if self._is_read(c.topic, c.msgtype, self._pose_topic)]
         count = sum(c.msgcount for c in looked_at)
         for number, (connection, received, raw) in enumerate(self._reader.messages(looked_at), start=1):
             topic, kind = connection.topic, connection.msgtype
             if self._listing is not None and (number % _REPORTED_EVERY == 0 or number == count):
                 self._listing(number, count)
-            if kind in _IMAGES:
-                if topic not in first:
-                    first[topic] = self._reader.deserialize(raw, kind)
-                    stamps[topic] = []
-                stamps[topic].append((_stamp_s(raw, ros2=self._reader.is2), received))
-            elif kind == _INFO and topic not in infos:
-                infos[topic] = self._reader.deserialize(raw, kind)
-            elif kind == _TF and pose_topic is None:
-                tree.add(self._reader.deserialize(raw, kind), fixed="static" in topic)
-            elif kind == _TF and "static" in topic:
-                tree.add(self._reader.deserialize(raw, kind), fixed=True)
-            elif topic == pose_topic:
-                tree.add_pose(self._reader.deserialize(raw, kind), "")
-            elif topic.endswith("/option/Depth_Units/value"):
-                sensor = topic.split("/option/")[0]
-                stated: Any = self._reader.deserialize(raw, kind)
-                units[sensor] = float(stated.data)
+            if kind not in _IMAGES:
+                if topic not in self._infos:
+                    self._take(topic, kind, self._reader.deserialize(raw, kind))
+                continue
+            if topic not in first:
+                first[topic] = self._reader.deserialize(raw, kind)
+            stamps.setdefault(topic, []).append((_stamp_s(raw), received))
         streams = {}
         for topic, rows in stamps.items():
             rows.sort()
             frame = first[topic].header.frame_id.lstrip("/")
             times, received_ns = np.array([t for t, _ in rows]), np.array([r for _, r in rows], np.int64)
             streams[topic] = Stream(topic, times, received_ns, frame, first[topic])
-        by_topic = {t: u for t in streams for sensor, u in units.items() if t.startswith(sensor) and u > 0}
-        return streams, tree, infos, by_topic
+        return streams
+
+    def _take(self, topic: str, kind: str, message: Any) -> None:
+        """Take in a message that is no picture."""
+        if kind == _INFO:
+            self._infos[topic] = message
+        elif kind == _TF and (self._pose_topic is None or "static" in topic):
+            self._tree.add(message, fixed="static" in topic)
+        elif topic == self._pose_topic:
+            self._tree.add_pose(message, "")
+        elif topic.endswith(_UNITS) and message.data > 0:
+            self._units[topic.split("/option/")[0]] = float(message.data)
 
     @staticmethod
     def _is_read(topic: str, kind: str, pose_topic: str | None) -> bool:
         """Whether messages hold pictures, cameras or poses; clouds and the like are not read."""
-        return kind in (*_IMAGES, _INFO, _TF) or topic == pose_topic or topic.endswith("/option/Depth_Units/value")
+        return kind in (*_IMAGES, _INFO, _TF) or topic == pose_topic or topic.endswith(_UNITS)
 
     def _only_pose_topic(self) -> str | None:
         """The only topic of poses where `/tf` does not move anything."""
@@ -406,7 +400,7 @@ class _Topics:
         return topics[0] if len(topics) == 1 else None
 
 
-def _stamp_s(raw: bytes, *, ros2: bool) -> float:
+def _stamp_s(raw: bytes) -> float:
     """Seconds of a message's header, without decoding the rest: after CDR's four bytes, or ROS 1's sequence number."""
     sec, nanosec = np.frombuffer(raw, "<u4", 2, 4)
     return float(sec) + 1e-9 * float(nanosec)

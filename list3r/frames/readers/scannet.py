@@ -14,9 +14,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import FolderLayout, Optics, natural_key, pose_matrix, read_numbers
+from list3r.frames.layout import FolderLayout, Optics, natural_key, pose_matrix, read_camera_matrix, read_numbers
 from list3r.frames.listing import FrameFile, FrameFiles
-from list3r.frames.options import Intrinsics, SourceOptions
+from list3r.frames.options import SourceOptions, intrinsics_of_matrix
 from list3r.frames.recordings.stored import CodedArray, FileSlice
 from list3r.memory.core.errors import SourceError
 
@@ -39,7 +39,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(
         FrameFile(color, root / "depth" / f"{color.stem}.png", root / "pose" / f"{color.stem}.txt") for color in colors
     )
-    cameras = [_matrix_file(root / "intrinsic" / f"intrinsic_{name}.txt") for name in ("color", "depth")]
+    cameras = [read_camera_matrix(root / "intrinsic" / f"intrinsic_{name}.txt") for name in ("color", "depth")]
     optics = Optics(options.intrinsics or cameras[0], (), cameras[1], _extrinsics(root), 1000.0)
     return FolderLayout("scannet", files, optics, "depth", None, ("cameras of intrinsic/",), upright_tags=False)
 
@@ -66,11 +66,10 @@ def find_file(path: Path, options: SourceOptions) -> FolderLayout:
     if not files:
         raise SourceError(f"{path} holds no frame; is the copy complete?")
     notes = [] if whole else [f"the file ends after {len(files)} of {count} frames; is the copy complete?"]
-    optics = Optics(options.intrinsics or _intrinsics(color_k), (), _intrinsics(depth_k), None, units)
-    T_color_depth = np.linalg.inv(color_e) @ depth_e
-    optics = Optics(
-        optics.intrinsics, (), optics.depth_intrinsics, _rigid_or_identity(T_color_depth), units, (height, width)
-    )
+    depth = intrinsics_of_matrix(depth_k.ravel().tolist())
+    color = options.intrinsics or intrinsics_of_matrix(color_k.ravel().tolist())
+    T_color_depth = _rigid_or_identity(np.linalg.inv(color_e) @ depth_e)
+    optics = Optics(color, (), depth, T_color_depth, units, (height, width))
     return FolderLayout("scannet", FrameFiles(files), optics, "depth", None, tuple(notes), upright_tags=False)
 
 
@@ -104,17 +103,6 @@ def _exactly(file: BinaryIO, count: int, path: Path) -> bytes:
 
 def _matrix(file: BinaryIO, path: Path) -> NDArray[np.float64]:
     return np.array(_MATRIX.unpack(_exactly(file, _MATRIX.size, path)), np.float64).reshape(4, 4)
-
-
-def _intrinsics(matrix: NDArray[np.float64]) -> Intrinsics:
-    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
-
-
-def _matrix_file(path: Path) -> Intrinsics:
-    rows = read_numbers(path) if path.is_file() else []
-    if len(rows) < 2 or min(len(rows[0]), len(rows[1])) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
-        raise SourceError(f"{path} is not a camera matrix; fix it, or give --intrinsics and --depth-intrinsics")
-    return rows[0][0], rows[1][1], rows[0][2], rows[1][2]
 
 
 def _extrinsics(root: Path) -> NDArray[np.float64]:

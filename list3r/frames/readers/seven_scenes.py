@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from list3r.frames.layout import FolderLayout, Optics, natural_key, read_numbers
+from list3r.frames.layout import FolderLayout, Optics, natural_key, read_camera_matrix
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.memory.core.errors import SourceError
@@ -72,8 +72,5 @@ def _files(folder: Path, name: str, present: set[str]) -> FrameFile:
 def _file_intrinsics(folder: Path, root: Path) -> tuple[Intrinsics, str]:
     for path in (folder / "camera-intrinsics.txt", root / "camera-intrinsics.txt"):
         if path.is_file():
-            rows = read_numbers(path)
-            if len(rows) < 2 or len(rows[0]) < 3 or len(rows[1]) < 3 or rows[0][0] <= 0 or rows[1][1] <= 0:
-                raise SourceError(f"{path} is not a 3x3 camera matrix; fix or remove it")
-            return (rows[0][0], rows[1][1], rows[0][2], rows[1][2]), f"intrinsics of {path.name}"
+            return read_camera_matrix(path), f"intrinsics of {path.name}"
     return KINECT_NOMINAL, "no camera-intrinsics.txt: the Kinect of 7-Scenes is assumed"

@@ -10,7 +10,6 @@ import math
 import re
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
 
@@ -52,27 +51,27 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     """The layout, or None when the folder has another. Raises `SourceError` for lists that cannot be read."""
     if not (root / "rgb.txt").is_file():
         return None
-    colors = _read_list(root / "rgb.txt")
+    color_s, colors = _read_list(root / "rgb.txt")
     notes: list[str] = []
     if (root / "depth.txt").is_file():
-        depths = _read_list(root / "depth.txt")
-        pairs = associate(colors.times_s, depths.times_s, MAX_PAIR_GAP_S)
+        depth_s, depths = _read_list(root / "depth.txt")
+        pairs = associate(color_s, depth_s, MAX_PAIR_GAP_S)
         if not len(pairs):
-            apart = f"rgb.txt begins at {colors.times_s[0]:.3f} s, depth.txt at {depths.times_s[0]:.3f} s"
+            apart = f"rgb.txt begins at {color_s[0]:.3f} s, depth.txt at {depth_s[0]:.3f} s"
             raise SourceError(
                 f"{root}: no colour image has a depth image within {MAX_PAIR_GAP_S:g} s; fix depth.txt ({apart})"
             )
         if len(pairs) < len(colors):
             alone = len(colors) - len(pairs)
             notes.append(f"{alone} of {len(colors)} colour images have no depth image of their time and are left out")
-        named: Iterator[Path | None] = (root / depths.name(d) for d in pairs[:, 1])
+        named: Iterator[Path | None] = (root / depths[d] for d in pairs[:, 1])
         picked = pairs[:, 0]
     else:
         picked, named = np.arange(len(colors)), repeat(None, len(colors))
-    times = colors.times_s[picked]
+    times = color_s[picked]
     poses = _poses(root / "groundtruth.txt", times)
     files = FrameFiles(
-        FrameFile(root / colors.name(c), depth, None, pose, float(time))
+        FrameFile(root / colors[c], depth, None, pose, float(time))
         for c, depth, pose, time in zip(picked, named, poses, times, strict=True)
     )
     intrinsics, distortion, camera_note = _camera(root, options)
@@ -125,27 +124,9 @@ def _nearest(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.int64
     return np.where(np.abs(a - b[left]) <= np.abs(b[right] - a), left, right)
 
 
-@dataclass(frozen=True)
-class _TimedNames:
-    """A list `timestamp filename`, ascending in time."""
-
-    times_s: NDArray[np.float64]
-    names: bytes
-    """One after the other."""
-    ends: NDArray[np.int64]
-    """Where each ends. Shape (N,)."""
-
-    def __len__(self) -> int:
-        return len(self.times_s)
-
-    def name(self, k: int) -> str:
-        """Return a name."""
-        return self.names[self.ends[k - 1] if k else 0 : self.ends[k]].decode("utf-8")
-
-
-def _read_list(path: Path) -> _TimedNames:
-    """Return a list. Raises `SourceError`."""
-    times_s, ends, names = array("d"), array("q"), bytearray()
+def _read_list(path: Path) -> tuple[NDArray[np.float64], list[str]]:
+    """Return times, ascending, and names of a list `timestamp filename`. Raises `SourceError`."""
+    times_s, names = array("d"), list[str]()
     for number, line in enumerate(read_lines(path), start=1):
         text = line.strip()
         if not text or text.startswith("#"):
@@ -153,18 +134,13 @@ def _read_list(path: Path) -> _TimedNames:
         words = text.split(maxsplit=1)
         try:
             times_s.append(float(words[0]))
-            names += words[1].strip().replace("\\", "/").encode("utf-8")
+            names.append(words[1].strip().replace("\\", "/"))
         except (ValueError, IndexError):
             raise SourceError(f"{path}: line {number} is not 'timestamp filename'; fix or remove it") from None
-        ends.append(len(names))
     if not times_s:
         raise SourceError(f"{path} names no image; is the copy complete?")
-    found = _TimedNames(as_seconds(np.frombuffer(times_s)), bytes(names), np.frombuffer(ends, np.int64))
-    if np.all(np.diff(found.times_s) > 0):
-        return found
-    rows = sorted((time, found.name(k)) for k, time in enumerate(found.times_s.tolist()))
-    coded = [name.encode("utf-8") for _, name in rows]
-    return _TimedNames(np.array([time for time, _ in rows]), b"".join(coded), np.cumsum([len(n) for n in coded]))
+    rows = sorted(zip(as_seconds(np.frombuffer(times_s)).tolist(), names, strict=True))
+    return np.array([time for time, _ in rows]), [name for _, name in rows]
 
 
 def _poses(path: Path, times_s: NDArray[np.float64]) -> Iterator[NDArray[np.float64] | None]:

@@ -12,7 +12,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Frame, FrameSource, SourceInfo
 from list3r.frames.decoding.exif import believable, film_focal
 from list3r.frames.decoding.picture import Upright, small_gray
 from list3r.frames.decoding.shown import LOOKED_AT, check_no_panorama, shown_note, shown_part
@@ -32,7 +32,7 @@ _EARLIER = 4
 """Key frames that are tried, back from the nearest, before a frame counts as damaged."""
 
 
-class VideoSource(Reader):
+class VideoSource(FrameSource):
     """A `FrameSource` over one video stream. Every `read` opens the file again and seeks to its first frame."""
 
     def __init__(
@@ -61,7 +61,6 @@ class VideoSource(Reader):
         self._info = self._describe()
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on; the others are decoded, but made no array of."""
         for number, image in islice(self.pictures(start, stop), 0, None, step):
             if image is None:
                 yield BadFrame(number, _DAMAGED)
@@ -91,12 +90,7 @@ class VideoSource(Reader):
         """Seconds of a frame."""
         return self._time_s(number)
 
-    def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
-        return self._chosen.position(index)
-
     def look(self, spots: int) -> Iterator[tuple[int, str]]:
-        """Number of some frames and why each cannot be used, empty where it can: runs behind key frames all over."""
         stamps, count = self._stamps, len(self._chosen)
         keys = np.searchsorted(stamps.stamps, stamps.keys) if not stamps.counted else np.zeros(0, int)
         starts = np.unique([0, *(self._chosen.position(int(k)) for k in keys)])
@@ -107,12 +101,10 @@ class VideoSource(Reader):
                 yield number, _DAMAGED if image is None else ""
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
-        """Small grey pictures of all frames handed out, as stored, in one pass; None for one that is damaged."""
         for _, image in self.pictures(0, len(self._chosen), threads=True):
             yield None if image is None else small_gray(image, _THUMBNAIL_PX)
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
-        """Grey pictures at positions [start, stop), as stored, of at most 640 px; None for one that is damaged."""
         for _, image in self.pictures(start, stop):
             yield None if image is None else small_gray(image, _LOOKED_AT_PX)
 
@@ -208,7 +200,6 @@ class VideoSource(Reader):
             notes.append(f"the file states no time for its frames: {self._fps:g} frames a second are assumed")
         if self._chosen.sharpest:
             notes.append("of each group of frames the sharpest is taken; --no-sharpest takes the first")
-        missing = missing_parts(depth=False, camera=rig.camera is not None)
         focal = None if rig.camera is not None else self._stamps.focal_35mm
         height, width = rig.shown_size
         guess = believable(None if focal is None else film_focal(focal, width, height), width, height)
@@ -221,10 +212,8 @@ class VideoSource(Reader):
             camera=rig.camera,
             has_depth=False,
             has_poses=False,
-            scale_kind="relative",
             fingerprint=fingerprint("video", listing, self._options),
             notes=tuple(notes),
-            missing=tuple(missing),
             image_size=rig.color_size,
             stored_size=rig.shown_size,
             corner=(0, 0) if rig.shown is None else (rig.shown.top, rig.shown.left),

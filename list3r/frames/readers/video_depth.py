@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import BadFrame, Camera, Frame, Reader, SourceInfo, missing_parts
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo
 from list3r.frames.beside import refuse_left
 from list3r.frames.decoding.decode import read_raw_depth, sure_depth
 from list3r.frames.folder import NOT_STANDING, NOWHERE_SURE, without_depth, without_pose
@@ -49,7 +48,7 @@ class RecordingParts:
     """Frames' own cameras, of the pictures as stored, where they differ from `intrinsics`."""
 
 
-class VideoWithDepth(Reader):
+class VideoWithDepth(FrameSource):
     """A `FrameSource`: the pictures of the video, each with depth and pose of its number."""
 
     def __init__(self, root: Path, parts: RecordingParts, options: SourceOptions) -> None:
@@ -69,7 +68,6 @@ class VideoWithDepth(Reader):
         self._info = self._describe(root, options.kind)
 
     def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
-        """As `read`, but only each `step`-th frame from `start` on."""
         for frame in self._video.read_every(start, stop, step):
             try:
                 yield frame if isinstance(frame, BadFrame) else self._with_depth(frame)
@@ -77,11 +75,9 @@ class VideoWithDepth(Reader):
                 yield BadFrame(frame.index, str(error))
 
     def position(self, index: int) -> int:
-        """Where a frame (Frame.index) is among those handed out."""
         return self._video.position(index)
 
     def read_poses(self) -> list[tuple[int, float, NDArray[np.float64]]]:
-        """Frame.index, seconds and pose of every frame that has one; no picture is decoded."""
         numbers = (self._video.number(k) for k in range(self._info.frame_count))
         found = ((k, self._video.time_s(k), self._parts.poses.get(k)) for k in numbers)
         return [(k, time_s, T) for k, time_s, T in found if T is not None]
@@ -103,10 +99,7 @@ class VideoWithDepth(Reader):
         path = None if self._parts.confidence is None else self._parts.confidence(number)
         if path is None or not path.is_file():
             return raw
-        confidence = read_raw_depth(path)
-        if confidence.shape != raw.shape:
-            confidence = cv2.resize(confidence, raw.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        return sure_depth(raw, confidence, self._parts.least_confidence)
+        return sure_depth(raw, read_raw_depth(path), self._parts.least_confidence)
 
     def _doubts(self) -> tuple[str, ...]:
         """Return what looks wrong with depth, of some frames spread over the recording."""
@@ -144,7 +137,6 @@ class VideoWithDepth(Reader):
             path=str(root),
             has_depth=bool(parts.depth),
             has_poses=bool(parts.poses),
-            scale_kind="metric" if parts.depth else "relative",
             depth_camera=registration.depth_camera if registration else None,
             T_color_depth=registration.T_color_depth if registration else None,
             depth_scale=self._rig.depth_scale if parts.depth else None,
@@ -156,7 +148,6 @@ class VideoWithDepth(Reader):
                 *lying_note(turns or 0),
                 *not_read_note(left),
             ),
-            missing=tuple(missing_parts(depth=bool(parts.depth), camera=info.camera is not None)),
             z_up=turns is not None,
             poses_drift=parts.poses_drift,
         )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.layout import read_calibration, read_json, read_numbers, read_text
-from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics
+from list3r.frames.options import Intrinsics, check_distortion, check_intrinsics, intrinsics_of_matrix
 from list3r.memory.core.errors import OptionError, SourceError
 
 _JSON = (
@@ -71,14 +71,14 @@ def _of_file(path: Path, name: str) -> StatedCamera | None:
         return _of_table(name, content) if isinstance(content, dict) else None
     if path.suffix == ".txt":
         numbers = [v for row in read_numbers(path) for v in row]
-        return StatedCamera(name, check_intrinsics(numbers) if len(numbers) == 4 else _of_matrix(numbers))
+        return StatedCamera(name, check_intrinsics(numbers) if len(numbers) == 4 else intrinsics_of_matrix(numbers))
     text = read_text(path)
     lens = [v for v in _list(text, "distortion_coefficients") if v]
     size = re.findall(r"^image_(?:width|height):\s*(\d+)", text, re.MULTILINE)
     width, height = map(int, size) if len(size) == 2 else (0, 0)
     return StatedCamera(
         name,
-        _of_matrix(_list(text, "camera_matrix")),
+        intrinsics_of_matrix(_list(text, "camera_matrix")),
         check_distortion(_list(text, "distortion_coefficients")) if lens else (),
         (height, width) if width and height else None,
     )
@@ -93,7 +93,8 @@ def _of_table(name: str, content: Mapping[str, Any]) -> StatedCamera | None:
         return next((c for c in inner if c is not None), None)
     if values is None and np.size(matrix) == 4:
         values = matrix
-    intrinsics = check_intrinsics([float(v) for v in values]) if values else _of_matrix(np.ravel(matrix).tolist())
+    numbers = [float(v) for v in values or np.ravel(matrix)]
+    intrinsics = check_intrinsics(numbers) if values else intrinsics_of_matrix(numbers)
     width, height = (int(content.get(a, content.get(b, 0))) for a, b in (("width", "w"), ("height", "h")))
     lens = content.get("distortion", content.get("distortion_coefficients", content.get("coeffs")))
     scale = next((float(content[k]) for k in _SCALES if isinstance(content.get(k), int | float)), None)
@@ -104,15 +105,6 @@ def _of_table(name: str, content: Mapping[str, Any]) -> StatedCamera | None:
         (height, width) if width and height else None,
         scale if scale and scale > 0 else None,
     )
-
-
-def _of_matrix(numbers: list[float]) -> Intrinsics:
-    """fx, fy, cx, cy of 9 numbers row by row or column by column, or of the 16 of a larger matrix."""
-    side = {9: 3, 16: 4}[len(numbers)]
-    m = np.array(numbers, np.float64).reshape(side, side)
-    if not m[0, 2] and not m[1, 2]:
-        m = m.T
-    return check_intrinsics([float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2])])
 
 
 def _list(text: str, name: str) -> list[float]:

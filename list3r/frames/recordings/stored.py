@@ -172,12 +172,7 @@ def _lzfse(data: bytes, count: int) -> bytes | None:
     buffer. Where the library hides it, the blocks are counted: each begins with 40,000 bytes that are new or 10,000
     that repeat, and unpacks to 24 MB at most, whatever it claims.
     """
-    try:
-        import lzfse
-    except ImportError:
-        raise OptionError(
-            f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
-        ) from None
+    lzfse = import_lzfse()
     fill = _filling(str(lzfse.__file__))
     if fill is not None:
         out = ctypes.create_string_buffer(count + 1)
@@ -189,6 +184,17 @@ def _lzfse(data: bytes, count: int) -> bytes | None:
         return bytes(lzfse.decompress(data))
     except (lzfse.error, MemoryError):
         return None
+
+
+def import_lzfse() -> Any:
+    """Return the package that packs depth of Record3D. Raises `OptionError` without the extra."""
+    try:
+        import lzfse
+    except ImportError:
+        raise OptionError(
+            f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
+        ) from None
+    return lzfse
 
 
 @lru_cache(maxsize=1)

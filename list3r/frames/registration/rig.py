@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
 from list3r.frames.decoding.decode import clean_depth
-from list3r.frames.decoding.shown import Shown
+from list3r.frames.decoding.shown import ShownPart
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.registration.reprojection import DepthReprojection, Undistortion
@@ -67,7 +67,7 @@ class Rig:
     registration: DepthReprojection | None
     shares_view: bool = False
     """Depth is of the colour camera itself, so that a picture with a camera of its own has depth of that camera."""
-    shown: Shown | None = None
+    shown: ShownPart | None = None
     """The part of the pictures as stored that is handed out; None for all."""
 
     @property
@@ -140,7 +140,7 @@ def build_rig(
     depth_size: tuple[int, int] | None,
     max_depth_m: float | None,
     max_side: int | None = None,
-    shown: Shown | None = None,
+    shown: ShownPart | None = None,
 ) -> Rig:
     """Check the cameras against the first images and tabulate. Raises `SourceError` and `OptionError`.
 
@@ -176,14 +176,14 @@ def build_rig(
     )
 
 
-def _whole_size(stored: tuple[int, int], shown: Shown | None, size: tuple[int, int]) -> tuple[int, int]:
+def _whole_size(stored: tuple[int, int], shown: ShownPart | None, size: tuple[int, int]) -> tuple[int, int]:
     if shown is None:
         return size
     scale = size[0] / shown.size[0], size[1] / shown.size[1]
     return round(stored[0] * scale[0]), round(stored[1] * scale[1])
 
 
-def _corner(stored: tuple[int, int], shown: Shown | None, size: tuple[int, int]) -> tuple[int, int]:
+def _corner(stored: tuple[int, int], shown: ShownPart | None, size: tuple[int, int]) -> tuple[int, int]:
     """Row and column of the whole pictures where what is handed out begins."""
     if shown is None:
         return 0, 0

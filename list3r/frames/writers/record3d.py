@@ -12,25 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from list3r.frames.base import Camera, Frame
 from list3r.frames.recordings.axes import arkit_of_pose
-from list3r.frames.writers.pictures import jpeg
-from list3r.memory.core.errors import OptionError, install_hint
+from list3r.frames.recordings.stored import import_lzfse
+from list3r.frames.writers.base import SequenceWriter, jpeg
 
 SURE = 2
 """Confidence of depth that is known (stored 0, 1, 2)."""
 
 
-class Record3dWriter:
+class Record3dWriter(SequenceWriter):
     """Writes `walk.r3d` frame by frame; depth may have another size than the pictures, and shares their view."""
 
     def __init__(self, folder: Path, camera: Camera, fps: float) -> None:
-        try:
-            import lzfse
-        except ImportError:
-            raise OptionError(
-                f"depth of Record3D is packed with LZFSE, which needs a package: {install_hint('record3d')}"
-            ) from None
-        self._pack = lzfse.compress
-        self._camera, self._fps = camera, fps
+        super().__init__(folder, camera, fps)
+        self._pack = import_lzfse().compress
         self._depth_size: tuple[int, int] | None = None
         self._poses: list[list[float]] = []
         self._times: list[float] = []
@@ -53,7 +47,6 @@ class Record3dWriter:
         self._times.append(frame.time_s)
 
     def close(self) -> None:
-        """Write the metadata."""
         self._archive.writestr("metadata", json.dumps(self._metadata()))
         self._archive.close()
 

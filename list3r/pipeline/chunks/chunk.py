@@ -19,7 +19,6 @@ from list3r.association.overlap.motion import flag_dynamic
 from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, guessed_camera
 from list3r.frames.chunking.borrowing import Borrowed, Repeat, borrow, frames_around
 from list3r.frames.chunking.chunks import ChunkSpan
-from list3r.frames.deferred import read_some
 from list3r.frames.source import SourceOptions, open_source
 from list3r.instances.base import Discoverer, Tracker
 from list3r.instances.library import build_library
@@ -96,7 +95,7 @@ def _read(task: ChunkTask, source: FrameSource) -> list[Frame | BadFrame]:
     """
     start, stop = task.span.start, task.span.stop
     if task.depth_every > 1 and entry(task.settings.reconstruction).skips:
-        some = list(read_some(source, start, stop, task.depth_every))
+        some = list(source.read_some(start, stop, task.depth_every))
         if not any(isinstance(frame, BadFrame) for frame in some):
             return some
     return list(source.read(start, stop))
@@ -329,11 +328,9 @@ class _JointModel:
         self._task = task
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Reconstruct a chunk."""
         return self._made()(frames, camera)
 
     def joint(self, sides: Sequence[WindowSide]) -> tuple[Reconstruction, ...]:
-        """Reconstruct all sides in one gauge."""
         return reconstruct_jointly(self._made(), sides)
 
     def _made(self) -> Reconstructor:
@@ -379,8 +376,7 @@ def _detector(settings: BuildSettings) -> LearnedDetector | None:
     """The network of the local features, loaded once in a process; None for SIFT."""
     if settings.local_features == "sift":
         return None
-    device = "cpu" if settings.device == "auto" else settings.device
-    return make_detector(settings.local_features, Path(settings.feature_weights or ""), device)
+    return make_detector(settings.local_features, Path(settings.feature_weights or ""), settings.device)
 
 
 @lru_cache(maxsize=2)

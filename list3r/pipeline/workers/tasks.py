@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from multiprocessing.connection import wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from queue import SimpleQueue
 from typing import Generic, TypeVar
 
-from list3r.pipeline.workers.pool import LIVENESS_POLL_S
 from list3r.pipeline.workers.worker import Worker, WorkerError, WorkerJob
 
 Task = TypeVar("Task")
@@ -27,66 +25,55 @@ class TaskPool(Generic[Task, Result]):
         workers: int,
         environment: Callable[[int], Mapping[str, str]] = lambda place: {},
     ) -> None:
-        self._work = work
-        self._places: list[Worker | None] = [None] * workers
-        self._environment = environment
-        self._waiting: deque[WorkerJob] = deque()
+        self._work, self._environment = work, environment
+        self._threads = ThreadPoolExecutor(workers)  # each waits for one process
+        self._free = SimpleQueue[int]()
+        for place in range(workers):
+            self._free.put(place)
+        self._processes: dict[int, Worker] = {}
+        self._open: dict[Future[Result], Task] = {}
+        self._cancelled = False
 
     def submit(self, task: Task) -> None:
         """Take a task, which begins as soon as a process is idle."""
-        self._waiting.append(WorkerJob(self._work, task))
+        self._open[self._threads.submit(self._run, task)] = task
 
     def as_completed(self) -> Iterator[tuple[Task, Result | BaseException]]:
         """Yield tasks as they end, with the result, with what the function raised, or with a `WorkerError`.
 
-        Ends when no task is left; those that are submitted between two of them are worked on as well.
+        More may be submitted meanwhile.
         """
-        while self._waiting or any(p is not None and p.job is not None for p in self._places):
-            yield from self._hand_out()
-            busy = {p.connection: n for n, p in enumerate(self._places) if p is not None and p.job is not None}
-            ready = {busy[c] for c in wait(list(busy), LIVENESS_POLL_S)}  # type: ignore[index]
-            for place in sorted(busy.values()):
-                yield from self._look_at(place, place in ready)
+        while self._open:
+            for future in wait(self._open, return_when=FIRST_COMPLETED).done:
+                error = future.exception()
+                yield self._open.pop(future), future.result() if error is None else error
 
     def cancel(self) -> None:
         """End all processes at once and forget all tasks."""
-        self._waiting.clear()
-        processes = [p for p in self._places if p is not None]
-        self._places = [None] * len(self._places)
+        self._cancelled = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        processes = list(self._processes.values())
         for process in processes:
             process.kill()
+        self._threads.shutdown()
         for process in processes:
             process.close()
+        self._open.clear()
 
-    def _hand_out(self) -> Iterator[tuple[Task, WorkerError]]:
-        """Give tasks to idle processes; yield those whose process had ended meanwhile."""
-        for place, process in enumerate(self._places):
-            if not self._waiting or (process is not None and process.job is not None):
-                continue
-            job = self._waiting.popleft()
-            if process is None:
-                process = self._places[place] = Worker(self._environment(place))
-            try:
-                process.begin(job)
-            except WorkerError as error:
-                self._remove(place)
-                yield job.argument, error  # type: ignore[misc]
-
-    def _look_at(self, place: int, ready: bool) -> Iterator[tuple[Task, Result | BaseException]]:
-        process = self._places[place]
-        assert process is not None and process.job is not None
-        job = process.job
+    def _run(self, task: Task) -> Result:
+        job, place = WorkerJob(self._work, task), self._free.get()
         try:
-            process.finish() if ready else process.check_alive()
-        except WorkerError as error:
-            self._remove(place)
-            yield job.argument, error  # type: ignore[misc]
-        if job.done:
-            yield job.argument, job.result if job.error is None else job.error  # type: ignore[misc]
-
-    def _remove(self, place: int) -> None:
-        process, self._places[place] = self._places[place], None
-        if process is not None:
-            with contextlib.suppress(OSError):
-                process.kill()
-            process.close()
+            if place not in self._processes:
+                self._processes[place] = Worker(self._environment(place))
+                if self._cancelled:
+                    self._processes[place].kill()
+            self._processes[place].begin(job)
+            self._processes[place].finish()
+        except WorkerError:
+            self._processes.pop(place).close()
+            raise
+        finally:
+            self._free.put(place)
+        if job.error is not None:
+            raise job.error
+        return job.result  # type: ignore[no-any-return]

@@ -41,7 +41,6 @@ class Aliked:
         self._device = torch.device(device)
 
     def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
-        """Return the `count` most confident features of a picture (H, W, 3), best first."""
         height, width = color.shape[:2]
         with torch.inference_mode():
             picture = torch.from_numpy(np.ascontiguousarray(color)).to(self._device).permute(2, 0, 1)[None].float()

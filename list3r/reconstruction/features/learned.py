@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,8 @@ class LearnedFeatures:
     """In [0, 1]. Shape (N,)."""
 
 
-class LearnedDetector(Protocol):
-    """A network that detects and describes."""
-
-    def __call__(self, color: NDArray[np.uint8], count: int) -> LearnedFeatures:
-        """Return the `count` most confident features of a picture (H, W, 3)."""
-        ...
+LearnedDetector = Callable[[NDArray[np.uint8], int], LearnedFeatures]
+"""A network that returns at most so many of the most confident features of a picture (H, W, 3)."""
 
 
 def as_bytes(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -81,7 +81,6 @@ class FeedforwardReconstructor:
         self._budget: MemoryBudget | None = None
 
     def __call__(self, frames: Sequence[Frame], camera: Camera) -> Reconstruction:
-        """Reconstruct a chunk. Raises `TrackingError`, and `OptionError` for the first time."""
         placement = self._network.loader.place(camera.height, camera.width)
         side = WindowSide(frames, camera, self._options.camera_known)
         budget = self._ready(placement)

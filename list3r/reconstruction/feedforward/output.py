@@ -14,9 +14,9 @@ from list3r.frames.base import Camera, Frame
 from list3r.memory.core.errors import TrackingError
 from list3r.reconstruction.base import DepthNoise, Reconstruction
 from list3r.reconstruction.feedforward.pictures import Placement
-from list3r.reconstruction.feedforward.settings import NetworkSettings
 from list3r.reconstruction.poses import select_keyframes
 from list3r.reconstruction.rgbd.confidence import next_to_edge
+from list3r.reconstruction.settings import NetworkSettings
 
 LEAST_CONFIDENCE = 0.05
 """Depth of less confidence than this is unknown (the threshold of pi3's authors in their odometry)."""

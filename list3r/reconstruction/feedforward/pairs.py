@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.core.errors import DegenerateError
+from list3r.memory.core.geometry import umeyama
 from list3r.reconstruction.feedforward.output import WindowOutput
 from list3r.reconstruction.feedforward.points import from_points
 
@@ -60,7 +62,7 @@ def join_pairs(pairs: Sequence[PairPoints], count: int) -> WindowOutput:
 
 
 @dataclass(frozen=True)
-class _Edge:
+class _PairEdge:
     """Similarity x_first = s R x_second + t between two pictures' own points."""
 
     first: int
@@ -97,7 +99,7 @@ def _own_points(
 
 def _edge(
     pair: PairPoints, points: NDArray[np.float32], confidence: NDArray[np.float32], scale_of: dict[int, float]
-) -> _Edge | None:
+) -> _PairEdge | None:
     """Return the similarity from the second picture's points to the first one's, None where too few are confident."""
     a = pair.points[1].reshape(-1, 3).astype(np.float64) * scale_of[id(pair)]
     b = points[pair.second].reshape(-1, 3).astype(np.float64)
@@ -107,27 +109,21 @@ def _edge(
         return None
     a, b, w = a[good], b[good], w[good]
     for _ in range(3):
-        s, R, t = _similarity(a, b, w)
-        off = np.linalg.norm(a - s * b @ R.T - t, axis=1)
+        try:
+            S = umeyama(b, a, w, with_scale=True)
+        except DegenerateError:
+            return None
+        off = np.linalg.norm(a - S.apply(b), axis=1)
         w = w / (1.0 + (off / max(2.0 * float(np.median(off)), 1e-9)) ** 2)
-    if not (np.isfinite(s) and s > 0):
+    if not S.scale > 0:
         return None
     depth = float(np.median(points[pair.first][..., 2][confidence[pair.first] > 0]))
-    return _Edge(pair.first, pair.second, float(pair.confidence.mean()), float(np.log(s)), R, t, depth)
+    return _PairEdge(
+        pair.first, pair.second, float(pair.confidence.mean()), float(np.log(S.scale)), S.rotation, S.translation, depth
+    )
 
 
-def _similarity(a: Array, b: Array, w: Array) -> tuple[float, Array, Array]:
-    """Return scale, rotation and translation of a = s R b + t, weighted (Umeyama 1991)."""
-    w = w / w.sum()
-    mean_a, mean_b = w @ a, w @ b
-    u, d, vt = np.linalg.svd(((a - mean_a) * w[:, None]).T @ (b - mean_b))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    R = (u * sign) @ vt
-    s = float((d * sign).sum() / max(float(w @ ((b - mean_b) ** 2).sum(axis=1)), 1e-12))
-    return s, R, mean_a - s * R @ mean_b
-
-
-def _synchronised(edges: Sequence[_Edge], count: int) -> tuple[Array, Array, Array]:
+def _synchronised(edges: Sequence[_PairEdge], count: int) -> tuple[Array, Array, Array]:
     """Return log scales (n,), rotations (n, 3, 3) and translations (n, 3) of pictures in the best connected one.
 
     x_world = e^s R x_picture + t, so that of an edge s_b = s_a + s_ab, R_b = R_a R_ab, t_b = t_a + e^s_a R_a t_ab. NaN
@@ -157,7 +153,7 @@ def _synchronised(edges: Sequence[_Edge], count: int) -> tuple[Array, Array, Arr
     return s, R, t
 
 
-def _reached(edges: Sequence[_Edge], count: int) -> set[int]:
+def _reached(edges: Sequence[_PairEdge], count: int) -> set[int]:
     """Return the largest connected component of pictures."""
     group = list(range(count))
     for e in edges:

@@ -131,7 +131,6 @@ class PictureSize:
         return max(1, rows) * PATCH, max(1, columns) * PATCH
 
     def place(self, height: int, width: int) -> Placement:
-        """Return the placement of a frame of a size in its picture."""
         size = self.of(height, width)
         return Placement(size, size)
 
@@ -144,7 +143,6 @@ class PaddedSize:
     resample: Resample = BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return the placement of a frame of a size in its picture."""
         short = max(1, round(min(height, width) * self.longest / max(height, width) / PATCH)) * PATCH
         if width >= height:
             return Placement((short, self.longest), (short, self.longest))
@@ -159,7 +157,6 @@ class WidthSize:
     resample: Resample = BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return the placement of a frame of a size in its picture."""
         inner = max(1, round(height * self.width / width / PATCH)) * PATCH, self.width
         shown = min(inner[0], self.width)
         return Placement(inner, (shown, self.width), -((inner[0] - shown) // 2))
@@ -174,7 +171,6 @@ class CutSize:
     resample: Resample = LANCZOS_OR_BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return the placement of a frame of a size in its picture."""
         scale = self.longest / max(height, width)
         inner = round(height * scale), round(width * scale)
         rows, columns = (max(1, 2 * (side // 2) // self.patch) * self.patch for side in inner)
@@ -193,7 +189,6 @@ class TabledSize:
     resample: Resample = LANCZOS_OR_BICUBIC
 
     def place(self, height: int, width: int) -> Placement:
-        """Return the placement of a frame of a size in its picture."""
         _, columns, rows = min(self.shapes, key=lambda shape: abs(shape[0] - width / height))
         scale = max(columns / width, rows / height) + 1e-8
         inner = math.floor(height * scale), math.floor(width * scale)

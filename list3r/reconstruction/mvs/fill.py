@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.mvs.settings import RegionFillSettings
-from list3r.reconstruction.order_statistics import medians
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -62,7 +61,7 @@ def _plane_of_rim(
     """(c, a, b) of inverse depth = c + a x + b y in the box, None where the rim is no plane."""
     size = 2 * settings.rim_px + 1
     near = cv2.dilate(region.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-    own = medians(color[region])
+    own = np.median(color[region], axis=0)
     alike = np.abs(color - own).max(axis=2) < settings.rim_color
     rows, columns = np.nonzero(near & ~region & (inverse > 0) & (sigma < settings.sigma) & alike)
     if len(rows) < settings.rim_least:

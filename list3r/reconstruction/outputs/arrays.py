@@ -49,11 +49,9 @@ class ArraysReader:
     name = "predictions.npz of VGGT or results.npz of DA3"
 
     def recognises(self, path: Path) -> bool:
-        """Return whether a path is one file."""
         return path.is_file()
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return the predictions of a file. Raises `SourceError` and `OptionError`."""
         names = sorted({n for p in PROGRAMS for n in (p.poses, p.intrinsics, p.confidence)} | {"depth"})
         found = read_arrays(path, tuple(names))
         program = next((p for p in PROGRAMS if {p.poses, p.intrinsics, "depth"} <= found.keys()), None)

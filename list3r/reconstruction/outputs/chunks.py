@@ -40,11 +40,9 @@ class ChunksReader:
     name = f"the folder of VGGT-Long or Pi-Long ({UNALIGNED}/chunk_N.npz)"
 
     def recognises(self, path: Path) -> bool:
-        """Return whether a folder has their chunks."""
         return (path / UNALIGNED).is_dir()
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return the saved output. Raises `SourceError` and `OptionError`."""
         files = sorted((path / UNALIGNED).glob("chunk_*.npz"), key=lambda p: int(re.sub(r"\D", "", p.stem) or 0))
         if not files:
             raise SourceError(f"{path / UNALIGNED} holds no chunk_N.npz: see docs/precomputed.md for chunk_N.npy")

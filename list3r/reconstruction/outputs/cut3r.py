@@ -25,11 +25,9 @@ class Cut3rReader:
     name = "the output folder of CUT3R or TTT3R (depth, conf, camera)"
 
     def recognises(self, path: Path) -> bool:
-        """Return whether a folder has the three."""
         return all((path / name).is_dir() for name in ("depth", "conf", "camera"))
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return the saved output. Raises `SourceError` and `OptionError`."""
         names = sorted(p.stem for p in (path / "camera").glob("*.npz"))
         if not names:
             raise SourceError(f"{path / 'camera'} holds no .npz files")

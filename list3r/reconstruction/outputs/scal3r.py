@@ -30,11 +30,9 @@ class Scal3rReader:
     name = "the result folder of Scal3R (mat.txt, intri.yml, depths)"
 
     def recognises(self, path: Path) -> bool:
-        """Return whether a folder has the three."""
         return (path / "mat.txt").is_file() and (path / "intri.yml").is_file() and (path / "depths").is_dir()
 
     def read(self, path: Path, options: OutputOptions) -> ProgramOutput:
-        """Return the saved output. Raises `SourceError` and `OptionError`."""
         T, K = _poses(path / "mat.txt"), _intrinsics(path / "intri.yml")
         if len(T) != len(K):
             raise SourceError(f"{path}: mat.txt has {len(T)} poses, intri.yml {len(K)} cameras")

@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import Camera, Frame
-from list3r.frames.deferred import LazyFrame
+from list3r.frames.base import Camera, Frame, LazyFrame
 from list3r.reconstruction.features.local import Features, detect
 from list3r.reconstruction.motion.residuals import Mask, MoverMemory, fit, mover_in_residuals, without
 from list3r.reconstruction.pose_prior import given_step

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.order_statistics import median, quantile
 from list3r.reconstruction.sfm.settings import PureRotationSettings
 
 Floats = NDArray[np.float64]
@@ -42,7 +41,7 @@ def turning_error(pairs: Sequence[tuple[Floats, Floats]], camera: Camera, settin
     def left(log_ratio: float) -> float:
         focal = 0.5 * (camera.fx + camera.fy) * float(np.exp(log_ratio))
         errors = [_pair_error(a, b, focal, settings) for a, b in centred]
-        return median(np.array(errors)) * 640.0 / longer
+        return float(np.median(errors)) * 640.0 / longer
 
     grid = np.linspace(-1.0, 1.0, 7) * np.log(settings.focal_ratio)
     found = [left(f) for f in grid]
@@ -77,5 +76,5 @@ def _pair_error(a: Floats, b: Floats, focal: float, settings: PureRotationSettin
         seen = rays_a @ R.T
         place = seen[:, :2] / np.maximum(seen[:, 2:], 1e-6) * focal
         off = np.linalg.norm(place - b, axis=1)
-        kept = off <= quantile(off, settings.share)
-    return quantile(off, settings.share)
+        kept = off <= np.quantile(off, settings.share)
+    return float(np.quantile(off, settings.share))

@@ -46,8 +46,7 @@ def make(options: ModelOptions) -> SfmReconstructor:
         device = "cpu" if find_gpu() is None else "cuda"
     detector = None
     if options.local_features != "sift":
-        where = "cpu" if options.device == "auto" else options.device
-        detector = make_detector(options.local_features, Path(options.feature_weights or ""), where)
+        detector = make_detector(options.local_features, Path(options.feature_weights or ""), options.device)
     return SfmReconstructor(options.settings.sfm, options.poses, device, options.camera_known, detector)
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.reconstruction.features.local import shrinkage, shrunk
-from list3r.reconstruction.order_statistics import median, medians
 from list3r.reconstruction.sfm.settings import CornerSettings
 
 Gray = NDArray[np.uint8]
@@ -82,8 +81,8 @@ def as_bright(
         gain = float(np.clip(gain, *_GAINS))
         offset = middle_b - gain * middle_a
         off = np.abs(gain * a + offset - b)
-        kept = off <= max(2.0, 3.0 * median(off))
-    was, left = median(np.abs(a - b)), median(np.abs(gain * a + offset - b))
+        kept = off <= max(2.0, 3.0 * np.median(off))
+    was, left = np.median(np.abs(a - b)), np.median(np.abs(gain * a + offset - b))
     if was < least or left > _MOST_UNEXPLAINED * was:
         return old
     return np.asarray(
@@ -185,7 +184,7 @@ class _Follower:
             return False
         moved = found.xy - self.alive.xy[np.searchsorted(self.alive.ids, found.ids)]
         self._moved = float(np.median(np.linalg.norm(moved, axis=1))) / self.longer
-        self.motion = medians(moved)
+        self.motion = np.median(moved, axis=0)
         self.alive, self.unrefined = found, 0 if due else self.unrefined + 1
         return True
 

@@ -88,7 +88,7 @@ def make_service(catalog: Catalog, secret: str, limits: ServiceLimits | None = N
     """Return the application of a catalogue; clients must send a token of the `secret`."""
     limits, metrics = limits or ServiceLimits(), Metrics()
     app = FastAPI(title="list3r", version=__version__, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
-    state, asked = _State(catalog, metrics), _Questions(catalog, limits)
+    state, asked = _Health(catalog, metrics), _Questions(catalog, limits)
     for path, answer in (("/health", state.health), ("/ready", state.ready), ("/metrics", state.counts)):
         app.add_api_route(path, answer)
     for path, ask in (
@@ -116,7 +116,7 @@ def from_environment() -> Application:
     return make_service(catalog, os.environ[SECRET_VARIABLE], limits)
 
 
-class _State:
+class _Health:
     """How the service is."""
 
     def __init__(self, catalog: Catalog, metrics: Metrics) -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.simulation.worlds.layout import Room
+from list3r.simulation.worlds.layout import SimulatedRoom
 from list3r.simulation.worlds.materials import TEXTURE_PX, bake, mip_levels
 from list3r.simulation.worlds.objects import BOX, Solids
 from list3r.simulation.worlds.world import HEIGHT_M, SimulatedWorld
@@ -157,7 +157,7 @@ def surface(solids: Solids, solid: NDArray[np.int64], points: Floats, toward: Fl
     return world.astype(np.float32), u.astype(np.float32), v.astype(np.float32)
 
 
-def _lamps(room: Room, aside: float) -> list[Floats]:
+def _lamps(room: SimulatedRoom, aside: float) -> list[Floats]:
     """One lamp in the middle of a room or to the side of it, several in a row where it is long."""
     count = max(1, round((room.x1 - room.x0) / _LAMP_M))
     share = (np.arange(count) + 0.5 * (1 + aside)) / count

@@ -36,7 +36,7 @@ SMALL_KINDS = ("mug", "box", "book", "ball", "bowl", "vase")
 
 
 @dataclass(frozen=True)
-class Room:
+class SimulatedRoom:
     """A rectangle of floor, metres, world."""
 
     x0: float
@@ -61,7 +61,7 @@ class Placer:
 
     def add(
         self,
-        room: Room,
+        room: SimulatedRoom,
         label: str,
         parts: f.Parts,
         x: float,
@@ -126,7 +126,7 @@ class Placer:
 
     def scatter(
         self,
-        room: Room,
+        room: SimulatedRoom,
         support: SimulatedObject,
         kinds: tuple[str, ...],
         width: float,
@@ -175,7 +175,7 @@ def _fill(placer: Placer, container: SimulatedObject, parts: f.Parts, label: str
     )
 
 
-def furnish_living_room(p: Placer, room: Room, walls: dict[str, int], floor: int) -> None:
+def furnish_living_room(p: Placer, room: SimulatedRoom, walls: dict[str, int], floor: int) -> None:
     """A room 4.0 m wide with the door on its right: dining table, sofa, shelf, sideboard."""
     rng, wide = p.rng, room.x1 - room.x0
     wood, seat = p.wood(), p.fabric()
@@ -207,7 +207,7 @@ def furnish_living_room(p: Placer, room: Room, walls: dict[str, int], floor: int
     _picture(p, room, 0.0, 2.75, -90, walls["west"])
 
 
-def _bookshelf(p: Placer, room: Room, floor: int) -> None:
+def _bookshelf(p: Placer, room: SimulatedRoom, floor: int) -> None:
     height, boards = 1.65, 4
     shelf = p.add(room, "bookshelf", f.shelf((0.85, 0.32, height), p.wood(), boards), 0.17, 1.52, -90, on=floor)
     levels = f.shelf_boards(height, boards)
@@ -233,14 +233,14 @@ def _shelf_plan(p: Placer) -> list[tuple[float, tuple[f.Parts, str]]]:
     ]
 
 
-def _picture(p: Placer, room: Room, x: float, y: float, yaw_deg: float, wall: int) -> None:
+def _picture(p: Placer, room: SimulatedRoom, x: float, y: float, yaw_deg: float, wall: int) -> None:
     w, h = p.rng.uniform(0.6, 0.85), p.rng.uniform(0.45, 0.6)
     frame = f.block((w, 0.03, h), (0, 0.015, h / 2), p.wood(0.4))
     sheet = f.block((w - 0.08, 0.004, h - 0.08), (0, 0.032, h / 2), p.bright("print", 0.9))
     p.add(room, "picture", (frame, sheet), x, y, yaw_deg, z=1.25, attached=wall)
 
 
-def furnish_bedroom(p: Placer, room: Room, walls: dict[str, int], floor: int) -> None:
+def furnish_bedroom(p: Placer, room: SimulatedRoom, walls: dict[str, int], floor: int) -> None:
     """A room 3.8 m wide with the door on its left: desk, bed, wardrobe, night table."""
     rng, wide = p.rng, room.x1 - room.x0
     rug = Material("stripes", *FABRICS[rng.integers(len(FABRICS))], 0.8, int(rng.integers(1 << 16)))

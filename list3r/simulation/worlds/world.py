@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from list3r.simulation.worlds import furniture as f
-from list3r.simulation.worlds.layout import WOODS, Placer, Room, furnish_bedroom, furnish_living_room, wall_paint
+from list3r.simulation.worlds.layout import (
+    WOODS,
+    Placer,
+    SimulatedRoom,
+    furnish_bedroom,
+    furnish_living_room,
+    wall_paint,
+)
 from list3r.simulation.worlds.materials import Material
 from list3r.simulation.worlds.objects import SimulatedObject, Vec3
 
@@ -30,7 +37,7 @@ class SimulatedWorld:
     """Rooms, objects, lamps, and a way through."""
 
     seed: int
-    rooms: tuple[Room, ...]
+    rooms: tuple[SimulatedRoom, ...]
     objects: tuple[SimulatedObject, ...]
     tour: tuple[Stop, ...]
     """A round through both rooms that comes back to where it starts."""
@@ -44,8 +51,8 @@ def make_world(seed: int = 0) -> SimulatedWorld:
     """Return the world of a seed: sizes, colours, mirroring and small objects are drawn from it."""
     rng = np.random.default_rng([seed, 1])
     depth = 3.8
-    living = Room(0.0, 4.0, depth, bool(rng.integers(2)))
-    bedroom = Room(4.0 + WALL_M, 4.0 + WALL_M + 3.8, depth, bool(rng.integers(2)))
+    living = SimulatedRoom(0.0, 4.0, depth, bool(rng.integers(2)))
+    bedroom = SimulatedRoom(4.0 + WALL_M, 4.0 + WALL_M + 3.8, depth, bool(rng.integers(2)))
     placer = Placer(rng)
     floors, walls = _shell(placer, (living, bedroom))
     furnish_living_room(placer, living, walls[0], floors[0])
@@ -53,7 +60,7 @@ def make_world(seed: int = 0) -> SimulatedWorld:
     return SimulatedWorld(seed, (living, bedroom), tuple(placer.objects), _tour(living, bedroom))
 
 
-def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[str, int]]]:
+def _shell(p: Placer, rooms: tuple[SimulatedRoom, SimulatedRoom]) -> tuple[list[int], list[dict[str, int]]]:
     """Floors, ceilings and walls; the ids of the floors and, for each room, of its walls by direction."""
     floors: list[int] = []
     walls: list[dict[str, int]] = []
@@ -77,14 +84,14 @@ def _shell(p: Placer, rooms: tuple[Room, Room]) -> tuple[list[int], list[dict[st
     return floors, walls
 
 
-def _floor(p: Placer, room: Room) -> int:
+def _floor(p: Placer, room: SimulatedRoom) -> int:
     low, high = WOODS[int(p.rng.integers(len(WOODS)))]
     boards = Material("wood", low, high, 1.1, int(p.rng.integers(1 << 16)))
     size = (room.x1 - room.x0 + WALL_M, room.depth, WALL_M)
     return p.add_structure("floor", f.flat(size, ((room.x0 + room.x1) / 2, room.depth / 2, -WALL_M / 2), boards)).id
 
 
-def _dividing_wall(p: Placer, room: Room) -> f.Parts:
+def _dividing_wall(p: Placer, room: SimulatedRoom) -> f.Parts:
     """Return the wall with the doorway in its middle and a wooden frame round it."""
     paint, trim = wall_paint(p), p.wood(0.7)
     x, (wide, high) = room.x1 + WALL_M / 2, DOOR_M
@@ -102,7 +109,7 @@ def _dividing_wall(p: Placer, room: Room) -> f.Parts:
     )
 
 
-def _tour(living: Room, bedroom: Room) -> tuple[Stop, ...]:
+def _tour(living: SimulatedRoom, bedroom: SimulatedRoom) -> tuple[Stop, ...]:
     """Stops in room coordinates (eye x, y; target x, y, z), turned to the world."""
     first = (
         (3.0, 1.85, 3.4, 0.30, 0.55),
@@ -129,7 +136,7 @@ def _tour(living: Room, bedroom: Room) -> tuple[Stop, ...]:
     return tuple(_stop(room, s) for room, s in stops)
 
 
-def _stop(room: Room, numbers: tuple[float, float, float, float, float]) -> Stop:
+def _stop(room: SimulatedRoom, numbers: tuple[float, float, float, float, float]) -> Stop:
     ex, ey, tx, ty, tz = numbers
     eye, target = room.world_xy(ex, ey), room.world_xy(tx, ty)
     return Stop((*eye, 1.5), (*target, tz))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, read_numbers, varies_note
+from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, read_numbers, there, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.readers.tum import poses_at
@@ -38,10 +38,10 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(
         FrameFile(
             color,
-            _there(root / "lowres_depth" / color.name),
+            there(root / "lowres_depth" / color.name),
             T_source_camera=pose,
             time_s=float(time),
-            confidence=_there(root / "confidence" / color.name),
+            confidence=there(root / "confidence" / color.name),
             lens=own_camera([*own[2:], *own[:2]], root) if own is not None and spread > VARIES else None,
         )
         for color, time, pose, own in zip(colors, times_s, _poses(traj, times_s), cameras, strict=True)
@@ -63,7 +63,6 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         "color",
         intrinsics,
         tuple(notes),
-        (),
         LEAST_CONFIDENCE,
         z_up=True,
         upright_tags=False,
@@ -75,10 +74,6 @@ def _time_s(path: Path) -> float:
         return float(path.stem.rsplit("_", 1)[-1])
     except ValueError:
         return float("nan")
-
-
-def _there(path: Path) -> Path | None:
-    return path if path.is_file() else None
 
 
 def _pincams(root: Path, times_s: NDArray[np.float64]) -> tuple[list[list[float]], list[list[float] | None]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, pose_matrix, read_json, varies_note
+from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, pose_matrix, read_json, there, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions, check_intrinsics
 from list3r.frames.recordings.axes import pose_of_arkit
@@ -41,10 +41,10 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(
         FrameFile(
             color,
-            _there(base / "depth" / f"{color.stem}.png"),
+            there(base / "depth" / f"{color.stem}.png"),
             T_source_camera=pose,
             time_s=1e-6 * int(color.stem) if color.stem.isdigit() else None,
-            confidence=_there(base / "confidence" / f"{color.stem}.png"),
+            confidence=there(base / "confidence" / f"{color.stem}.png"),
             lens=own_camera(stated, cameras) if stated is not None and spread > VARIES else None,
         )
         for color, stated, pose in rows
@@ -70,10 +70,6 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         poses_drift=not optimised,
         upright_tags=False,
     )
-
-
-def _there(path: Path) -> Path | None:
-    return path if path.is_file() else None
 
 
 def _camera(path: Path) -> tuple[list[float] | None, NDArray[np.float64] | None]:

@@ -24,7 +24,7 @@ from list3r.frames.beside import listed
 from list3r.frames.files import MAX_TEXT_BYTES
 from list3r.frames.layout import IMAGE_ENDINGS, VARIES, FolderLayout, Optics, read_json, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
-from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
+from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics, intrinsics_of_matrix
 from list3r.frames.recordings.axes import pose_of_arkit, pose_of_quaternion
 from list3r.frames.recordings.stored import CodedArray, Stored, ZipMember
 from list3r.memory.core.errors import OptionError, SourceError
@@ -58,10 +58,9 @@ class PhoneCamera:
     def of(cls, where: Path, content: Mapping[str, Any]) -> Self:
         """Return what the metadata of a recording state. Raises `SourceError`."""
         try:
-            k = column_by_column([float(v) for v in content["K"]])
             size = int(content["h"]), int(content["w"])
             depth = (int(content["dh"]), int(content["dw"])) if "dw" in content else None
-            intrinsics = check_intrinsics([k[0], k[4], k[6], k[7]])
+            intrinsics = intrinsics_of_matrix([float(v) for v in content["K"]])
         except (KeyError, TypeError, ValueError, IndexError, OptionError):
             raise SourceError(f"{where}: its metadata states no camera K with w and h; export it again") from None
         if min(size) < 1 or (depth is not None and not 0 < depth[0] * depth[1] <= MOST_DEPTH_PIXELS):
@@ -178,7 +177,7 @@ def _layout(
         time_s = _time(times, k, fps)
         files.append(FrameFile(stored(f"rgbd/{k}.jpg"), depth, None, pose, time_s, confidence, lens=lens))
     notes = ["camera and poses of Record3D (ARKit)"]
-    if column_by_column(content["K"]) != content["K"]:
+    if not any(content["K"][6:8]):
         notes.append("K of its metadata is written row by row, and read so")
     if spread > VARIES:
         notes.append(varies_note(spread, carried=True))
@@ -219,12 +218,6 @@ def _time(times: object, k: int, fps: object) -> float | None:
     if isinstance(times, list) and k < len(times) and isinstance(times[k], int | float) and math.isfinite(times[k]):
         return float(times[k])
     return k / fps if isinstance(fps, int | float) and fps > 0 else None
-
-
-def column_by_column(k: Sequence[float]) -> list[float]:
-    """Return the nine numbers of a camera matrix column by column, also where they are written row by row."""
-    rows = len(k) == 9 and k[6] == k[7] == 0 and bool(k[2] or k[5])
-    return [k[3 * column + row] for row in range(3) for column in range(3)] if rows else list(k)
 
 
 def _lenses(content: Mapping[str, Any], camera: PhoneCamera) -> tuple[float, list[Camera | None]]:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from list3r.frames.beside import listed
-from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read_json, varies_note
+from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read_json, there, varies_note
 from list3r.frames.listing import FrameFile, FrameFiles
-from list3r.frames.options import SourceOptions, check_intrinsics
+from list3r.frames.options import SourceOptions, check_intrinsics, intrinsics_of_matrix
 from list3r.frames.recordings.axes import pose_of_arkit
 from list3r.memory.core.errors import OptionError, SourceError
 
@@ -36,10 +36,10 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     files = FrameFiles(
         FrameFile(
             p,
-            _there(root, f"depth_{p.stem[6:]}.png"),
+            there(root / f"depth_{p.stem[6:]}.png"),
             T_source_camera=stated[p][1] if p in stated else None,
             time_s=stated[p][2] if p in stated else None,
-            confidence=_there(root, f"conf_{p.stem[6:]}.png"),
+            confidence=there(root / f"conf_{p.stem[6:]}.png"),
         )
         for p in colors
     )
@@ -61,18 +61,12 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     )
 
 
-def _there(root: Path, name: str) -> Path | None:
-    path = root / name
-    return path if path.is_file() else None
-
-
 def _table(path: Path) -> tuple[list[float], Any, float | None]:
     """fx, fy, cx, cy, the pose and seconds of a picture. Raises `SourceError`."""
     content: Any = read_json(path)
     try:
-        k = [float(v) for v in np.ravel(content["intrinsics"])]
         T = pose_matrix(float(v) for v in np.ravel(content["cameraPoseARFrame"]))
-        camera = check_intrinsics([k[0], k[4], k[2], k[5]])
+        camera = intrinsics_of_matrix([float(v) for v in np.ravel(content["intrinsics"])])
         time_s = float(content["time"]) if "time" in content else None
     except (KeyError, TypeError, ValueError, IndexError, OptionError):
         raise SourceError(f"{path} lacks intrinsics or cameraPoseARFrame of 3D Scanner App; export it again") from None

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.layout import VARIES, pose_matrix, read_json, varies_note
-from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
+from list3r.frames.options import Intrinsics, SourceOptions, intrinsics_of_matrix
 from list3r.frames.readers.video_depth import RecordingParts, VideoWithDepth
 from list3r.frames.recordings.stored import CodedArray, FileSlice
 from list3r.memory.core.errors import FrameError, OptionError, SourceError
@@ -67,18 +67,13 @@ def _cameras(path: Path) -> tuple[dict[int, Intrinsics], dict[int, NDArray[np.fl
     if not rows:
         raise SourceError(f"{path} names no frames frame_000000; is it of ScanNet++?")
     try:
-        stated = {number: _intrinsics(np.asarray(row["intrinsic"], np.float64)) for number, row in rows.items()}
+        stated = {number: intrinsics_of_matrix(np.ravel(row["intrinsic"]).tolist()) for number, row in rows.items()}
         found = {number: _pose(row) for number, row in rows.items()}
     except (KeyError, TypeError, ValueError, OptionError):
         raise SourceError(
             f"{path}: a frame lacks intrinsic (3 x 3) or aligned_pose (4 x 4); fix or remove it"
         ) from None
     return stated, {number: T for number, T in found.items() if T is not None}
-
-
-def _intrinsics(matrix: NDArray[np.float64]) -> Intrinsics:
-    k = matrix.reshape(3, 3)
-    return check_intrinsics([float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])])
 
 
 def _pose(row: Mapping[str, Any]) -> NDArray[np.float64] | None:

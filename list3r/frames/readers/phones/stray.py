@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import read_lines, read_numbers
-from list3r.frames.options import Intrinsics, SourceOptions, check_intrinsics
+from list3r.frames.layout import read_camera_matrix, read_lines, read_numbers
+from list3r.frames.options import Intrinsics, SourceOptions
 from list3r.frames.readers.video_depth import RecordingParts, VideoWithDepth
 from list3r.frames.recordings.axes import Z_UP_FROM_Y_UP, pose_of_quaternion
-from list3r.memory.core.errors import OptionError, SourceError
+from list3r.memory.core.errors import SourceError
 
 LEAST_CONFIDENCE = 1
 """Depth of confidence 0 is unknown (stored 0, 1, 2)."""
@@ -59,16 +59,9 @@ def _matrix(path: Path) -> tuple[Intrinsics, str]:
     """Return the camera, and how it is written."""
     if not path.is_file():
         raise SourceError(f"{path} is missing; is the copy complete? Without it, give --intrinsics fx,fy,cx,cy")
-    rows = read_numbers(path)
-    if len(rows) != 3 or any(len(row) != 3 for row in rows):
-        raise SourceError(f"{path} is not a 3x3 camera matrix; fix it, or give --intrinsics fx,fy,cx,cy")
-    note = "camera of camera_matrix.csv"
-    if rows[0][2] == rows[1][2] == 0 and any(rows[2][:2]):
-        rows, note = [list(row) for row in zip(*rows, strict=True)], f"{note} (written column by column)"
-    try:
-        return check_intrinsics([rows[0][0], rows[1][1], rows[0][2], rows[1][2]]), note
-    except OptionError as error:
-        raise SourceError(f"{path}: {error}") from None
+    last = [row for row in read_numbers(path) if row][-1:]
+    how = " (written column by column)" if last and any(last[0][:2]) else ""
+    return read_camera_matrix(path), f"camera of camera_matrix.csv{how}"
 
 
 def _odometry(path: Path) -> dict[int, NDArray[np.float64]]:
