@@ -55,13 +55,6 @@ def phrases() -> dict[tuple[str, ...], Token]:
 
 
 @cache
-def relation_words() -> dict[str, tuple[str, ...]]:
-    """Return what people say of how things stand to each other, and the predicates that it may mean."""
-    said = table()["relations"].items()
-    return {phrase: tuple(table()["predicates"][key]) for key, many in said for phrase in many.split("|")}
-
-
-@cache
 def openings(name: str) -> frozenset[tuple[str, ...]]:
     """Return phrases of the table as words."""
     said: Iterable[str] = table()[name].split("|") if isinstance(table()[name], str) else table()[name]
