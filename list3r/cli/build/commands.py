@@ -9,16 +9,15 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.build.build_options import BuildOptions
 from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
-from list3r.cli.common import JsonOption, spread
+from list3r.cli.common import JsonOption
 from list3r.cli.terminal import say
+from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import BuildReport
 
 
-@spread
 def inspect(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
@@ -75,13 +74,14 @@ def _check_overlay(overlay: Path, source: Path) -> None:
         raise OptionError(f"--overlay {overlay} is a picture of the source itself; name another file")
 
 
-@spread
 def build(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
-    asked: BuildOptions,
+    request: BuildRequest,
+    given: src.SourceArguments,
+    run: RunOptions,
     debug: Annotated[
         Path | None,
         typer.Option("--debug", metavar="DIR", help="Write pictures of masks, tracks and loops to this folder."),
@@ -92,12 +92,12 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    options = asked.given.options(more)
+    options = given.options(more)
     from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:
-        with watching("building", build_interrupted(memory, asked.run.resume), quiet=json, debug=debug) as watch:
-            return build_any(source, memory, options=options, settings=asked.request, run=asked.run, watch=watch)
+        with watching("building", build_interrupted(memory, run.resume), quiet=json, debug=debug) as watch:
+            return build_any(source, memory, options=options, settings=request, run=run, watch=watch)
 
     say_result(memory, work, report_lines, json)
 

@@ -11,7 +11,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import watching
-from list3r.cli.common import JsonOption, LicenceOption, only, print_table, spread
+from list3r.cli.common import JsonOption, LicenceOption, print_table
 from list3r.cli.terminal import say
 from list3r.pipeline.request import BuildRequest, RunOptions
 
@@ -87,14 +87,13 @@ def fetch_model(
         print_answer(done)
 
 
-@spread
 def precompute(
     source: src.SourceArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
     *,
-    request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
+    request: Annotated[BuildRequest, "reconstruction", "device", "weights", "poses", "chunk", "overlap"],
     given: src.SourceArguments,
-    run: Annotated[RunOptions, only("licence")],
+    run: Annotated[RunOptions, "licence"],
     force: Annotated[bool, typer.Option("--force", help="Write finished chunks again.")] = False,
     json: JsonOption = False,
 ) -> None:

@@ -10,12 +10,11 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
 from list3r.cli.build import source_options as src
-from list3r.cli.common import JsonOption, MemoryArgument, only, print_table, spread
+from list3r.cli.common import JsonOption, MemoryArgument, print_table
 from list3r.cli.terminal import say
 from list3r.pipeline.request import RunOptions
 
 
-@spread
 def detect(
     memory: MemoryArgument,
     detector: Annotated[
@@ -25,7 +24,7 @@ def detect(
         ),
     ],
     *,
-    run: Annotated[RunOptions, only("detector_classes")],
+    run: Annotated[RunOptions, "detector_classes"],
     source: Annotated[
         str | None,
         typer.Option(
