@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from list3r.api import SceneMemory
 
 MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memory file.", show_default=False)]
+IdArgument = Annotated[
+    int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
+]
+MIN_CONFIDENCE = "Everything with at least this confidence, also low-confidence segments (default: not listed)."
+MinConfidence = Annotated[float | None, typer.Option("--min-confidence", help=MIN_CONFIDENCE)]
 AtOption = Annotated[
     int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
 ]

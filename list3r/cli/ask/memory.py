@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, open_memory, print_table
+from list3r.cli.common import (
+    AtOption,
+    IdArgument,
+    JsonOption,
+    MemoryArgument,
+    MinConfidence,
+    in_column,
+    open_memory,
+    print_table,
+)
 from list3r.cli.terminal import note, say
 
 if TYPE_CHECKING:
@@ -59,13 +68,7 @@ def info(
 def list_instances(
     memory: MemoryArgument,
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
-    min_confidence: Annotated[
-        float | None,
-        typer.Option(
-            "--min-confidence",
-            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
-        ),
-    ] = None,
+    min_confidence: MinConfidence = None,
     at: AtOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -129,9 +132,7 @@ def _place(values: Any) -> str:
 
 def show(
     memory: MemoryArgument,
-    instance_id: Annotated[
-        int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
-    ],
+    instance_id: IdArgument,
     json: JsonOption = False,
 ) -> None:
     """Show one instance: where it is, how big, when it was seen, and its main relation to each other instance.

@@ -8,15 +8,13 @@ from typing import Annotated
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory
+from list3r.cli.common import IdArgument, JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import say
 
 
 def picture(
     memory: MemoryArgument,
-    instance_id: Annotated[
-        int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
-    ],
+    instance_id: IdArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default: instance_ID.jpg.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="The whole frame with its outline instead of a crop.")] = False,
     json: JsonOption = False,

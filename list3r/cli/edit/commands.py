@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.common import IdArgument, JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
     from list3r.memory.library.maintenance.edits import EditReport
 
-IdArgument = Annotated[
-    int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
-]
 AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Author of the edit; default: you.")]
 
 

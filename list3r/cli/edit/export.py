@@ -14,7 +14,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory
+from list3r.cli.common import JsonOption, MemoryArgument, MinConfidence, open_memory
 from list3r.cli.terminal import note, say
 from list3r.exporters.registry import FORMATS, find_format
 
@@ -81,13 +81,7 @@ def export(
         int | None,
         typer.Option("--workers", metavar="N", help="simready: worker processes; 0: work in this process."),
     ] = None,
-    min_confidence: Annotated[
-        float | None,
-        typer.Option(
-            "--min-confidence",
-            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
-        ),
-    ] = None,
+    min_confidence: MinConfidence = None,
     json: JsonOption = False,
 ) -> None:
     """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, an HTML
