@@ -23,7 +23,7 @@ from list3r.memory.library.change.surface_colors import (
     meeting,
     small_picture,
 )
-from list3r.memory.library.merging.edges import Key
+from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.summaries import ChunkSummary, world_unit
 from list3r.memory.library.overlap.visibility import (
     DepthView,
@@ -31,11 +31,11 @@ from list3r.memory.library.overlap.visibility import (
     OtherSurface,
     PlaceVisibility,
     changed_points,
+    chunk_views,
     in_sight_of,
     place_visibility,
-    seen_through_share,
+    seen_through_shares,
     tally,
-    views_of,
 )
 from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.library.relations.instance_geometry import fit_box
@@ -280,7 +280,7 @@ class Places:
 
     def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
         lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)
-        shares = (seen_through_share(points, views, self._s.visibility) for views in lists)
+        shares = (seen_through_shares([points], views, self._s.visibility)[0] for views in lists)
         return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
@@ -435,8 +435,8 @@ class Places:
     def _views_of(self, session: int, component: int) -> list[DepthView]:
         if (session, component) not in self._views:
             rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
-            keyframes = {c.chunk_id: self._store.keyframes.of(c.chunk_id) for c in rows}
-            self._views[session, component] = views_of(rows, keyframes, self.unit)
+            own = (chunk_views(c, self._store.keyframes.of(c.chunk_id), self.unit) for c in rows)
+            self._views[session, component] = [view for views in own for view in views]
         return self._views[session, component]
 
     def _points_of(self, key: Key) -> Array:
