@@ -81,12 +81,8 @@ def list_instances(
 
     least = min_confidence or 0.0
     check_share("--min-confidence", least)
-    with open_memory(memory, None if at is not None else min_confidence) as scene:
+    with open_memory(memory, None if at is not None else min_confidence, at) as scene:
         found: list[Instance] = scene.instances(structure=None if structure else False)
-        if at is not None:
-            from list3r.memory.library.maintenance.history import world_at
-
-            found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.lengths
     kept = [i for i in found if i.confidence >= least]
     kinds, starts = ("", "low-confidence", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)

@@ -106,9 +106,9 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the walk, the memory and the exports.")
     ] = Path("list3r-demo"),
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the random rooms.")] = 1,
-    frames: Annotated[int, typer.Option("--frames", help="Length of the walk, frames.")] = 300,
-    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Worker processes.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random rooms.")] = 1,
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Length of the walk, frames.")] = 300,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, metavar="N", help="Worker processes.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Simulate a walk through two furnished rooms, build its memory, ask it, export it. Nothing is downloaded.

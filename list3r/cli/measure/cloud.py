@@ -15,11 +15,10 @@ from list3r.cli.measure.options import (
     Estimate,
     EveryOption,
     PlotOption,
+    Scale,
     ScaleOption,
     Truth,
-    check_every,
     check_plot,
-    check_scale,
     free_scale,
     save_picture,
 )
@@ -72,8 +71,6 @@ def cloud(
     from list3r.evaluation.cloud import cloud_distances, evaluate_cloud
     from list3r.evaluation.point_clouds import thinned
 
-    check_scale(scale)
-    check_every(every)
     check_plot(plot)
     _check_lengths(threshold=threshold, truncate=truncate)
     found, _ = read_points(estimate)
@@ -130,7 +127,7 @@ def _figure(
 
 def _cloud_alignment(
     align: list[str] | None,
-    scale: str,
+    scale: Scale,
     truth: tuple[PointCloud, Trajectory | None, Path],
     estimate: tuple[PointCloud, Path],
 ) -> tuple[Sim3, str]:

@@ -15,7 +15,6 @@ from list3r.cli.measure.options import (
     EveryOption,
     PlotOption,
     Truth,
-    check_every,
     check_plot,
     save_picture,
     share,
@@ -61,7 +60,6 @@ def revisits(
     from list3r.memory.core.errors import OptionError
 
     settings = RevisitTruthSettings(least, different, precision)
-    check_every(every)
     check_plot(plot)
     if save is not None:
         if save.suffix.lower() != ".npz":
