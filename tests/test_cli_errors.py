@@ -218,7 +218,10 @@ MORE_CASES = {
     "covisibility that is none": ("eval revisits {p}/cut.npz {p}/room.l3r", "not a covisibility file"),
     "every zero of a cloud": ("eval cloud {p}/good {p}/room.l3r --every 0", "--every.*greater than or equal to 1"),
     "every zero of revisits": ("eval revisits {p}/good {p}/room.l3r --every 0", "--every.*greater than or equal to 1"),
-    "times that never meet": ("eval trajectory {p}/good {p}/room.l3r --tolerance nan", "--tolerance.*greater than or equal to 0"),
+    "times that never meet": (
+        "eval trajectory {p}/good {p}/room.l3r --tolerance nan",
+        "--tolerance.*greater than or equal to 0",
+    ),
 }
 
 

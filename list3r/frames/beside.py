@@ -85,7 +85,7 @@ def is_deep(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundFrames:
     """The pictures of a folder and what lies beside them, by what it is."""
 
     colors: list[Path]
@@ -94,7 +94,7 @@ class Found:
     notes: tuple[str, ...] = ()
 
 
-def look(root: Path, *, alone: bool = False) -> Found | None:
+def look(root: Path, *, alone: bool = False) -> FoundFrames | None:
     """The pictures in a folder, or in the one of its folders that is named as such; None where there are none.
 
     `alone`: depth that lies beside the folder itself may be left. Raises `SourceError` for a folder of depth, and where
@@ -118,7 +118,7 @@ def look(root: Path, *, alone: bool = False) -> Found | None:
     confidences = inside["confidence"] or _folder_of("confidence", others)
     masks = len(inside["mask"])
     notes = (f"{masks} images beside the pictures are named as masks and not read",) if masks else ()
-    return Found(inside["color"], depths, confidences, notes)
+    return FoundFrames(inside["color"], depths, confidences, notes)
 
 
 def _by_role(folder: Path) -> dict[Role, list[Path]]:

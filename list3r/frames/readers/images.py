@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from list3r.frames.beside import Found, Pairs, listed, look, pair
+from list3r.frames.beside import FoundFrames, Pairs, listed, look, pair
 from list3r.frames.layout import FolderLayout, Optics
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import SourceOptions
@@ -91,11 +91,11 @@ def _camera(root: Path, options: SourceOptions) -> StatedCamera | None:
         return None
 
 
-def _beside(found: Found) -> tuple[tuple[list[Path], str], ...]:
+def _beside(found: FoundFrames) -> tuple[tuple[list[Path], str], ...]:
     return (found.depths, "depth"), (found.confidences, "confidence")
 
 
-def _pairs(root: Path, found: Found, files: list[Path], what: str) -> Pairs | None:
+def _pairs(root: Path, found: FoundFrames, files: list[Path], what: str) -> Pairs | None:
     return pair(root, found.colors, files, what) if files else None
 
 

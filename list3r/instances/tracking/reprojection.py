@@ -135,7 +135,7 @@ class LabelledChunk:
             if len(track.frames) < least or stability < self.settings.track.min_stability or len(support.points) < 10:
                 continue
             found = zip(self.proposals, self.joined, strict=True)
-            seen = _Views([(p, n) for p, owner in found for n in np.flatnonzero(owner == number).tolist()])
+            seen = _SeenViews([(p, n) for p, owner in found for n in np.flatnonzero(owner == number).tolist()])
             plane, structure = seen.surface(views)
             stability *= 1.0 if structure else seen.whole()
             record, own = track.record(size), seen.feature()
@@ -270,7 +270,7 @@ def _look_for(
 
 
 @dataclass(frozen=True)
-class _Views:
+class _SeenViews:
     """The candidates, on all anchors, that one instance was found as."""
 
     found: Sequence[tuple[Proposals, int]]
