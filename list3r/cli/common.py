@@ -17,6 +17,7 @@ import typer
 
 from list3r.cli.terminal import draws, say, write
 from list3r.memory.core.description.printable import shown
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -44,8 +45,6 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothin
 
 def parse_point(text: str, option: str) -> tuple[float, float, float]:
     """Three numbers with commas. Raises `OptionError` naming the option."""
-    from list3r.memory.core.errors import OptionError
-
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:

@@ -21,6 +21,7 @@ from list3r.cli.common import (
     print_table,
 )
 from list3r.cli.terminal import note, say
+from list3r.memory.core.errors import check_share
 
 if TYPE_CHECKING:
     from list3r.memory.core.records import DetectedLabel, Instance, Relation
@@ -76,7 +77,6 @@ def list_instances(
 
     Example: list3r list house.l3r --min-confidence 0.2
     """
-    from list3r.memory.core.errors import check_share
     from list3r.memory.core.records import FIRST_SCRAP, FIRST_UNLISTED
 
     least = min_confidence or 0.0

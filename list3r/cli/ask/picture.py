@@ -10,6 +10,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import IdArgument, JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 
 
 def picture(
@@ -26,7 +27,6 @@ def picture(
     from PIL import Image
 
     from list3r.exporters.output import replacing
-    from list3r.memory.core.errors import OptionError
 
     out = out or Path(f"instance_{instance_id}.jpg")
     if out.suffix.lower() not in (".jpg", ".jpeg", ".png"):

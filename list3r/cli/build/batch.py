@@ -13,6 +13,7 @@ from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.common import JsonOption, print_table
 from list3r.cli.terminal import note, write
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.request import BuildRequest, RunOptions, option
 
 if TYPE_CHECKING:
@@ -73,7 +74,6 @@ def batch(
     from list3r.batch.engines.choice import make_engine
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
-    from list3r.memory.core.errors import OptionError
     from list3r.pipeline.finishing import check_run
 
     check_run(run)

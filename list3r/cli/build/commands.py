@@ -12,6 +12,7 @@ from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
 from list3r.cli.common import JsonOption
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
@@ -65,7 +66,6 @@ def inspect(
 def _check_overlay(overlay: Path, source: Path) -> None:
     """Raises `OptionError` or `ExportError` before any work where the picture cannot or must not be written."""
     from list3r.exporters.output import check_target
-    from list3r.memory.core.errors import OptionError
 
     if overlay.suffix.lower() != ".png":
         raise OptionError(f"--overlay {overlay}: the picture must end in .png")

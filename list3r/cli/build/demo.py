@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +70,6 @@ def _render(walk: Path, *, seed: int, frames: int | None, workers: int | None, q
 
 def _remove_unfinished(walk: Path) -> None:
     """Delete leftovers of an interrupted demo: only files and folders that the simulation writes."""
-    import shutil
-
     for name in ("rgb", "depth", "ids"):
         shutil.rmtree(walk / name, ignore_errors=True)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "truth.json"):

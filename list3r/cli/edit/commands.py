@@ -11,6 +11,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import IdArgument, JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -195,8 +196,6 @@ def _run_edit(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool)
 
 def _parse_parts(text: str) -> list[tuple[int, int]]:
     """`3:4,5:2` as pairs. Raises `OptionError`."""
-    from list3r.memory.core.errors import OptionError
-
     try:
         pairs = [part.split(":") for part in text.split(",")]
         return [(int(chunk), int(local)) for chunk, local in pairs]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +25,7 @@ from list3r.cli.measure.options import (
 )
 from list3r.cli.terminal import say
 from list3r.exporters.output import is_database
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -134,7 +136,6 @@ def _cloud_alignment(
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register
     from list3r.evaluation.scene import alignment_of
-    from list3r.memory.core.errors import OptionError
     from list3r.memory.core.geometry import Sim3
 
     (true, true_path, source), (found, estimate_path) = truth, estimate
@@ -168,10 +169,6 @@ def _normals(points: PointCloud) -> Any:
 
 
 def _check_lengths(**lengths: float | None) -> None:
-    import math
-
-    from list3r.memory.core.errors import OptionError
-
     for name, value in lengths.items():
         if value is not None and not (math.isfinite(value) and value > 0):
             raise OptionError(f"--{name} {value:g}: give a length above 0, in metres")

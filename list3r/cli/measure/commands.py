@@ -24,6 +24,7 @@ from list3r.cli.measure.options import (
 from list3r.cli.measure.revisits import revisits
 from list3r.cli.terminal import say
 from list3r.exporters.output import is_database
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -124,7 +125,6 @@ def instances(
     Example: list3r eval instances walk/truth.json rooms.l3r --plot found.png
     """
     from list3r.evaluation.scene import evaluate_scene, read_scene
-    from list3r.memory.core.errors import OptionError
 
     if align not in (None, "none") and estimate.is_file() and not is_database(estimate):
         raise OptionError(f"--align {align} aligns a memory; {estimate} is not one and has no camera path")
@@ -162,7 +162,6 @@ def _identities(
 ) -> dict[str, Any] | None:
     """Id switches, None where there are no true ids of pixels or the estimate has no masks."""
     from list3r.evaluation.identity import evaluate_identities
-    from list3r.memory.core.errors import OptionError
 
     folder = ids or truth.parent / "ids"
     if ids is not None and not ids.is_dir():

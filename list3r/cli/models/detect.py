@@ -12,6 +12,7 @@ from list3r.cli.bar import progress_bar
 from list3r.cli.build import source_options as src
 from list3r.cli.common import JsonOption, MemoryArgument, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.request import RunOptions
 
 
@@ -41,8 +42,6 @@ def detect(
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
-    from list3r.memory.core.errors import OptionError
-
     if source is None and given != src.SourceArguments():
         raise OptionError("options of a video, such as --every, need the video: --source SOURCE")
     from list3r.pipeline.finishing import load_detector, name_things
