@@ -12,7 +12,7 @@ from list3r.memory.core.description.colors import color_names, color_words, main
 from list3r.memory.core.description.describe import describe
 from list3r.memory.core.geometry import Array
 from list3r.memory.core.records import Instance
-from list3r.memory.library.instances import DerivedInstance, Members, derived_instance
+from list3r.memory.library.instances import DerivedInstance, derived_instance
 from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry
@@ -74,7 +74,8 @@ def record_alone(
     store, world, component = scene.store, scene.world, scene.component(group[0][0])
     of = {k: (shapes[k], scene.pose(k), np.zeros(len(shapes[k].points), bool)) for k, _ in group}
     upright = world.upright and component == world.first
-    found = derived_instance(instance_id, Members(group, group, of, component, upright), scene.settings.derive)
+    settings = scene.settings.derive
+    found = derived_instance(instance_id, group, of, component, upright=upright, settings=settings)
     kind = flagged_only([found.geometry])[0] if bounds else None
     found = replace(found, geometry=replace(found.geometry, structure=kind, confidence=round(confidence, 4)))
     metric = store.facts.scale_kind != "relative"
