@@ -57,7 +57,7 @@ class SharedWork:
             for module, name in _PLACES:
                 original = getattr(import_module(module), name)
                 stack.enter_context(patch(f"{module}.{name}", self._once(f"{original.__module__}.{name}", original)))
-            stack.enter_context(patch("list3r.memory.store.rows.npz._LEVEL", 0))
+            stack.enter_context(patch("list3r.memory.store.rows.codec._LEVEL", 0))
             yield
 
     def _once(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -80,8 +80,8 @@ def open(
     Many can read while one writes; a second writer is refused. With `at` every question is about the world as it was
     after that session, and nothing can be written. Raises `OptionError` for an unknown session.
 
-    With `min_confidence` every question is about all instances with at least that confidence, including scraps, which
-    are otherwise not listed. Nothing can be written then, and with `at` there are no scraps.
+    With `min_confidence` every question is about all instances with at least that confidence, low-confidence segments
+    too, which are otherwise not listed. Nothing can be written then, and with `at` there are none of these.
 
     >>> list3r.open("house.l3r", at=1).nearest((0.5, 1.2, 0.8))
     >>> list3r.open("house.l3r", min_confidence=0.2).instances()
@@ -91,16 +91,16 @@ def open(
     if at is None and min_confidence is None:
         return SceneMemory(Store.open(path, writable=writable))
     if writable:
-        which = "with its scraps" if at is None else f"as it was after session {at}"
+        which = "with what it does not list" if at is None else f"as it was after session {at}"
         raise OptionError(f"{path} {which} can only be read")
     with Store.open(path) as store:
         if at is not None:
             from list3r.memory.library.maintenance.as_of import store_at
 
             return SceneMemory(store_at(store, at))
-        from list3r.memory.library.maintenance.with_scraps import store_with_scraps
+        from list3r.memory.library.maintenance.unlisted import store_with_unlisted
 
-        return SceneMemory(store_with_scraps(store, min_confidence or 0.0))
+        return SceneMemory(store_with_unlisted(store, min_confidence or 0.0))
 
 
 @naming_extras()

@@ -10,9 +10,10 @@ import numpy as np
 from list3r.memory.core.constraints import Constraints
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import MergeDecision, Support
-from list3r.memory.library.merging.edges import Key, MergeSettings, form_groups, links_of, pair_scores
+from list3r.memory.library.merging.edges import form_groups, links_of
 from list3r.memory.library.merging.nodes import Nodes
-from list3r.memory.library.overlap.pair_scores import Numbering, PairTable
+from list3r.memory.library.merging.settings import MergeSettings
+from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairTable, pair_scores
 from list3r.memory.library.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes
 from list3r.memory.store.tables.local_instances import LocalNode
 

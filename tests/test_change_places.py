@@ -15,7 +15,7 @@ from list3r.memory.core.records import Edge
 from list3r.memory.library.change.free_space_carving import FreeSpaceCarving
 from list3r.memory.library.change.places import Places
 from list3r.memory.library.consolidation import consolidate
-from list3r.memory.library.merging.edges import pair_scores
+from list3r.memory.library.overlap.pair_scores import pair_scores
 from list3r.memory.library.overlap.point_verdicts import UNTOLD
 from list3r.memory.library.overlap.summaries import chunk_summaries
 from list3r.memory.library.overlap.visibility import (
@@ -23,7 +23,7 @@ from list3r.memory.library.overlap.visibility import (
     VisibilitySettings,
     in_sight_of,
     point_visibility,
-    seen_through_share,
+    seen_through_shares,
     tally,
 )
 from list3r.memory.store.store import Store
@@ -51,7 +51,7 @@ def test_a_point_counts_the_frames_that_see_it_and_that_see_through_it() -> None
 
 @pytest.mark.parametrize(("depths", "share"), [((2.0, 2.01), 0.0), ((2.6, 2.6), 1.0), ((1.2, 0.0), None), ((), None)])
 def test_a_surface_is_seen_through_or_not_or_nothing_is_told(depths: tuple[float, ...], share: float | None) -> None:
-    assert seen_through_share(_patch(), [_view(d, k) for k, d in enumerate(depths)], S) == share
+    assert seen_through_shares([_patch()], [_view(d, k) for k, d in enumerate(depths)], S) == [share]
 
 
 def test_what_a_view_tells_lies_in_what_it_can_see() -> None:

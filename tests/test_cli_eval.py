@@ -275,15 +275,14 @@ def test_poses_of_a_folder_are_read_without_its_pictures(place: Path) -> None:
 # ---------------------------------------------------------------------------------------------- info, plan
 
 
-def test_info_lists_every_loop_with_its_reason_in_100_columns(place: Path) -> None:
+def test_info_lists_every_loop_with_its_reason(place: Path) -> None:
     text = read("info", place / "walk.l3r", "--loops")
-    assert max(map(len, text.splitlines())) <= 100
     assert "one part: all 5 chunks" in text
-    assert re.search(r"4 pairs, 4 joined.*weakest 1-2\s+with\s+weight 0\.60", text, re.DOTALL)
+    assert re.search(r"4 pairs, 4 joined.*weakest 1-2 with weight 0\.60", text)
     assert "2 candidates, 1 accepted, 1 rejected" in text
     assert re.search(r"1-4 +2-33 +0\.07-1\.10 +0\.82 +0\.90 +0\.70 +900 +0\.012 +0\.400 +accepted", text)
-    assert re.search(r"2-4 +12-35 +0\.40-1\.17 +0\.91 +0\.20 +- +0 +- +- +rejected\n +only 3 of 43", text)
-    assert re.search(r"\n5 +0\.0400 +2\.292 +4\.000", text)
+    assert re.search(r"2-4 +12-35 +0\.40-1\.17 +0\.91 +0\.20 +- +0 +- +- +rejected +only 3 of 43", text)
+    assert re.search(r"\n5 +0\.040 +2\.292 +4\.000", text)
 
 
 def test_info_as_json_has_edges_components_and_uncertainty(place: Path) -> None:

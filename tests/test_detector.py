@@ -30,11 +30,12 @@ from list3r.memory.library.labels import (
     votes_of_probabilities,
 )
 from list3r.memory.library.maintenance import edits
+from list3r.memory.library.overlap.pair_scores import box_iou
 from list3r.memory.store.store import Store
 from list3r.queries.find import find
 from list3r.semantics.detection import detect
 from list3r.semantics.detector import Detections
-from list3r.semantics.nanodet import PUBLISHED, DetectorSettings, NanoDet, overlaps, read_class_names, suppressed
+from list3r.semantics.nanodet import PUBLISHED, DetectorSettings, NanoDet, read_class_names, suppressed
 from list3r.semantics.voting import ThingInFrame, summed, vote
 from list3r.weights import PublishedFile, fetch_files
 from tests.session_scenes import ROOM, add_session, cameras, place_together
@@ -76,13 +77,8 @@ def test_what_stays_does_not_overlap_and_what_goes_overlaps_something_surer(rows
     assert scores[kept].tolist() == sorted(scores[kept].tolist(), reverse=True)
     for k in range(len(rows)):
         same = [j for j in kept if classes[j] == classes[k] and j != k]
-        near = [j for j in same if overlaps(boxes[k], boxes[[j]])[0] > 0.5]
+        near = [j for j in same if box_iou(boxes[[k]], boxes[[j]])[0, 0] > 0.5]
         assert (k in kept and not near) or (k not in kept and any(scores[j] >= scores[k] for j in near))
-
-
-def test_overlaps_of_known_boxes() -> None:
-    others = np.array([[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30], [0, 0, 0, 0]], np.float32)
-    np.testing.assert_allclose(overlaps(box(0, 0, 10, 10), others), [1.0, 1 / 3, 0.0, 0.0], atol=1e-6)
 
 
 @needs_weights
@@ -107,7 +103,7 @@ def test_a_real_network_finds_cups_chairs_and_the_table(name: str) -> None:
     # Half as large, the same things are found at half the place.
     half = network(cv2.resize(color, (320, 240), interpolation=cv2.INTER_AREA))
     table = [b.boxes_xyxy[b.classes == COCO_80.index("dining table")][0] for b in (boxes, half)]
-    assert overlaps(table[0], 2 * table[1][None])[0] > 0.7
+    assert box_iou(table[0][None], 2 * table[1][None])[0, 0] > 0.7
     odd = network(color[:333, :517])
     assert (odd.boxes_xyxy[:, 2] <= 517).all() and (odd.boxes_xyxy[:, 3] <= 333).all()
 
@@ -398,7 +394,7 @@ def test_what_is_only_known_to_be_a_seat_is_told_so_and_found_after_the_chairs(
         assert store.detected_labels.all()[red].level == "branch" and store.instances.get(red).label == "seat"
         assert find(store, "seat")[0].instance.id == red
         assert find(store, "how many chairs are there?").counted == 1
-    assert run(["query", "find", str(memory), "chair", "--json"]) == 0
+    assert run(["find", str(memory), "chair", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["matches"]
     assert [r["id"] for r in rows] == [green, red] and rows[1]["score"] < 0.5 < rows[0]["score"]
     assert "may be a chair" in rows[1]["reason"]

@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from list3r.memory.core.geometry import Sim3
+from list3r.memory.core.geometry import Sim3, stack
 from list3r.memory.core.records import ChunkRow
 from list3r.memory.library.overlap.voxels import chunk_shapes
-from list3r.memory.library.uncertainty import position_covariance, position_sigma, signs_of
+from list3r.memory.library.uncertainty import point_covariances, position_sigmas, signs_of
 from tests.memory_scenes import IMAGE, MUG, TABLE, node, surface
 
 
 def chunk(S: Sim3, covariance: np.ndarray | None, chunk_id: int = 0) -> ChunkRow:
     return ChunkRow(chunk_id, 0, 0, 0, 9, 0, S, (50.0, 50.0, 32.0, 24.0), (48, 64), "relative", covariance)
+
+
+def position_sigma(center: np.ndarray, chunks: list[ChunkRow]) -> float | None:
+    every = np.arange(len(chunks))
+    return position_sigmas(center[None], np.zeros_like(every), every, chunks)[0]
 
 
 def test_it_is_what_sampling_says() -> None:
@@ -23,8 +28,7 @@ def test_it_is_what_sampling_says() -> None:
     center = np.array([2.0, 1.0, -1.0])
     errors = Sim3.exp(rng.normal(size=(20000, 7)) @ half.T)
     moved = (S @ errors).apply(np.tile(S.inverse().apply(center[None]), (20000, 1, 1)))[:, 0]
-    expected = position_covariance(chunk(S, half @ half.T), center)
-    assert expected is not None
+    expected = point_covariances(stack([S]), half @ half.T, center[None])[0]
     assert np.allclose(np.cov(moved.T), expected, atol=0.05 * np.trace(expected))
     sigma = position_sigma(center, [chunk(S, half @ half.T)])
     assert sigma == pytest.approx(np.sqrt(np.linalg.eigvalsh(expected)[-1]))

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from list3r.memory.core.geometry import Sim3
-from list3r.memory.library.merging.edges import Key
+from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.voxels import chunk_shapes, coverage
 from tests.memory_scenes import BOX, CHAIR, IMAGE, MUG, ROOM, TABLE, Piece, Walk, merge_nodes, node, surface, walk
 

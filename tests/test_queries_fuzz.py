@@ -17,7 +17,7 @@ from list3r.api import SceneMemory
 from list3r.cli.app import run
 from list3r.memory.core.errors import List3rError
 from list3r.memory.store.store import Store
-from list3r.queries.finding.tokens import relation_words
+from list3r.queries.finding.tokens import table
 from list3r.queries.match import Filters, Match
 from list3r.queries.relations import ALL_PREDICATES
 from tests.conftest import THOROUGH, write_small_room
@@ -39,7 +39,7 @@ def memory(room: Path) -> Iterator[SceneMemory]:
 
 WORDS = st.one_of(
     st.sampled_from(
-        [*relation_words(), *ALL_PREDICATES, "the", "and", "a", "mug", "table", "white", "small", "biggest", "wall"]
+        [*table()["relations"], *ALL_PREDICATES, "the", "and", "a", "mug", "table", "white", "small", "biggest", "wall"]
     ),
     st.sampled_from(
         ["#3", "2", "77", "-1", "0", "9" * 40, "thing", "chairs", "huge", "elephant", "between", "", "\x00"]

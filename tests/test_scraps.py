@@ -13,8 +13,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.memory.core.errors import OptionError, UnknownIdError
 from list3r.memory.core.records import FIRST_SCRAP, FIRST_UNLISTED, ChunkResult, LocalInstance
-from list3r.memory.library.maintenance.scraps import derive_scraps
-from list3r.memory.library.maintenance.unlisted import derive_unlisted
+from list3r.memory.library.maintenance.unlisted import derive_segments, derive_unlisted
 from list3r.memory.store.store import Store
 from tests.memory_scenes import BOX, CHAIR, FLOOR, MAGAZINE, MUG, TABLE, Piece
 from tests.test_consolidation import add, chunk, content, create, local
@@ -47,16 +46,16 @@ def test_what_is_listed_does_not_depend_on_scraps(tmp_path: Path) -> None:
         Store.open(build(tmp_path / "none.l3r", plain)) as two,
     ):
         assert content(one) == content(two)
-        assert one.verify() == [] and len(derive_scraps(one)) == 2 and derive_scraps(two) == []
+        assert one.verify() == [] and len(derive_segments(one)) == 2 and derive_segments(two) == []
 
 
 def test_scraps_of_several_chunks_are_one_and_bear_a_lasting_id(tmp_path: Path) -> None:
     chunks = [with_scraps(k, LISTED, [MUG], whole=0.2 + 0.1 * k) for k in range(3)]
     first = build(tmp_path / "one.l3r", chunks[:1])
     with Store.open(first) as store:
-        (before,) = derive_scraps(store)
+        (before,) = derive_segments(store)
     with Store.open(build(tmp_path / "all.l3r", chunks)) as store:
-        (scrap,) = derive_scraps(store)
+        (scrap,) = derive_segments(store)
     assert scrap.instance.id == before.instance.id == FIRST_SCRAP and len(scrap.members) == 3
     assert scrap.instance.confidence == pytest.approx(0.3) and before.instance.confidence == pytest.approx(0.2)
     assert np.allclose(scrap.instance.center, MUG.center, atol=0.03)
@@ -66,7 +65,7 @@ def test_a_scrap_of_one_chunk_that_is_a_thing_of_another_is_that_thing(tmp_path:
     chunks = [with_scraps(0, LISTED, [MUG]), chunk(1, [*LISTED, MUG]), chunk(2, [*LISTED, MUG])]
     with Store.open(build(tmp_path / "m.l3r", chunks)) as store:
         near = [i for i in store.instances.all() if np.allclose(i.center, MUG.center, atol=0.03)]
-        assert len(near) == 1 and derive_scraps(store) == []
+        assert len(near) == 1 and derive_segments(store) == []
 
 
 def test_every_question_can_be_asked_of_scraps_too(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ import typer
 import typer.core
 
 from list3r.cli.answer import print_error, wants_json
+from list3r.cli.common import expanded
 from list3r.cli.terminal import OutputError, flush, mute, note, prepare_streams, say
 from list3r.memory.core.address_space import BUILD_MB, check_address_space
 from list3r.memory.core.errors import List3rError, MemoryFileWarning, naming_extras
@@ -128,7 +129,7 @@ def _add(app: typer.Typer, module: ModuleType, names: Iterable[str]) -> None:
         if isinstance(found, typer.Typer):
             app.add_typer(found, name=name)
         else:
-            app.command(name)(found)
+            app.command(name)(expanded(found))
 
 
 def _options(

@@ -11,17 +11,23 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
 from list3r.cli.terminal import draws, say, write
 from list3r.memory.core.description.printable import shown
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
 
 MemoryArgument = Annotated[Path, typer.Argument(metavar="MEMORY", help="The memory file.", show_default=False)]
+IdArgument = Annotated[
+    int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
+]
+MIN_CONFIDENCE = "Everything with at least this confidence, also low-confidence segments (default: not listed)."
+MinConfidence = Annotated[float | None, typer.Option("--min-confidence", help=MIN_CONFIDENCE)]
 AtOption = Annotated[
     int | None, typer.Option("--at", metavar="SESSION", help="Show the world as it was after this session.")
 ]
@@ -39,8 +45,6 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothin
 
 def parse_point(text: str, option: str) -> tuple[float, float, float]:
     """Three numbers with commas. Raises `OptionError` naming the option."""
-    from list3r.memory.core.errors import OptionError
-
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -61,86 +65,55 @@ def open_memory(path: Path, min_confidence: float | None = None, at: int | None 
         yield scene
 
 
-def only(*names: str) -> tuple[str, ...]:
-    """Return the fields of a dataclass that a command takes: `request: Annotated[RunOptions, only(...)]`."""
-    return names
-
-
-def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with parameters that are dataclasses of options expanded to one option for each field.
-    `source: SourceArguments` in its signature becomes all fields of `SourceArguments`, in that place and order. A field
-    that is such a dataclass itself is expanded too.
+def expanded(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command as typer takes it: a parameter that is a dataclass becomes an option for each of its fields, or
+    for those that its annotation names: `run: Annotated[RunOptions, "licence"]`.
     """
-    signature = inspect.signature(command, eval_str=True)
-    groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {}
+    groups: dict[str, tuple[Any, list[Field[Any]]]] = {}
     options: list[inspect.Parameter] = []
-    for name, parameter in signature.parameters.items():
-        group, *markers = get_args(parameter.annotation) or (parameter.annotation,)
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        group, *named = get_args(parameter.annotation) or (parameter.annotation,)
         if not is_dataclass(group):
             options.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
             continue
-        groups[name] = group, [o for o in _options_of(group) if not markers or o.name in markers[0]]
-        options += groups[name][1]
+        hints, kept = get_type_hints(group), [f for f in fields(group) if not named or f.name in named]
+        groups[name] = group, kept
+        options += [_as_option(f, hints[f.name]) for f in kept]
+    if not groups:
+        return command
 
     @functools.wraps(command)
     def gathered(**values: Any) -> None:
-        given = {n: {p.name: values.pop(p.name) for p in parameters} for n, (_, parameters) in groups.items()}
-        command(**values, **{n: _gathered(group, given[n]) for n, (group, _) in groups.items()})
+        given = {n: {f.name: _given(f, values.pop(f.name)) for f in kept} for n, (_, kept) in groups.items()}
+        command(**values, **{n: group(**given[n]) for n, (group, _) in groups.items()})
 
-    gathered.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
+    gathered.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     gathered.__annotations__ = {p.name: p.annotation for p in options}
     return gathered
 
 
-def _options_of(group: Any) -> list[inspect.Parameter]:
-    """Return the options that a dataclass represents."""
-    types = get_type_hints(group, include_extras=True)
-    inner = [
-        _options_of(types[f.name]) if is_dataclass(types[f.name]) else [_as_option(f, types[f.name])]
-        for f in fields(group)
-    ]
-    return [option for options in inner for option in options]
-
-
-def _gathered(group: Any, given: dict[str, Any]) -> Any:
-    """Return the dataclass made of the values of its options."""
-    types = get_type_hints(group)
-    inner = {f.name: _gathered(types[f.name], given) for f in fields(group) if is_dataclass(types[f.name])}
-    own = {f.name: _given(group, f.name, given[f.name]) for f in fields(group) if f.name in given}
-    return group(**inner, **own)
-
-
 def _as_option(f: Field[Any], kind: Any) -> inspect.Parameter:
-    """Return the parameter that typer makes an option of."""
-    help_ = f.metadata.get("help")
-    if help_ is None:
-        return inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kind)
-    default = f.default
-    if get_origin(kind) is tuple:
+    """Return the parameter that typer makes an option of: what `pipeline.request.option` says of a field."""
+    said, default, choices = f.metadata["help"], f.default, None
+    if isinstance(default, tuple):
         kind, default = list[str] | None, None
+    if "|" in (said.metavar or "") and said.metavar.islower():
+        choices = said.metavar.split("|").copy
     option = typer.Option(
-        help_.flag or f"--{f.name.replace('_', '-')}",
-        metavar=help_.metavar,
-        help=help_.text,
+        said.flag or f"--{f.name.replace('_', '-')}",
+        metavar=said.metavar,
+        help=said.text,
         show_default=default is not None and default is not False,
-        autocompletion=_choices(help_.metavar or ""),
+        autocompletion=choices,
     )
     return inspect.Parameter(
         f.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
     )
 
 
-def _choices(metavar: str) -> Callable[[], list[str]] | None:
-    """Return the completions of an option that is one of several words."""
-    return metavar.split("|").copy if "|" in metavar and metavar.islower() else None
-
-
-def _given(group: Any, name: str, value: Any) -> Any:
+def _given(f: Field[Any], value: Any) -> Any:
     """Return the value of an option as the dataclass has it: several words are a tuple."""
-    declared = any(f.name == name and "help" in f.metadata for f in fields(group))
-    several = declared and (value is None or isinstance(value, list))
-    default = next(f.default for f in fields(group) if f.name == name)
-    return tuple(value or ()) if several and isinstance(default, tuple) else value
+    return tuple(value or ()) if isinstance(f.default, tuple) else value
 
 
 _DRAWN_ROWS = 200

@@ -21,8 +21,8 @@ from list3r.queries.finding.grammar import IN_ROOM, Clause, Phrase, Question, pa
 from list3r.queries.finding.naming import SYNONYM, called, looser, name_score, tiers, why_named
 from list3r.queries.finding.ordering import ordered, sized
 from list3r.queries.finding.related import PhraseMatch, PhraseSearch, related
-from list3r.queries.finding.words import STRUCTURE, no_such_words
-from list3r.queries.match import Match, Matches, checked_count, checked_instance, of_one_state
+from list3r.queries.finding.words import STRUCTURE, no_such_words, wanted_words
+from list3r.queries.match import Filters, Match, Matches, checked_count, checked_instance, of_one_state
 from list3r.queries.relations import Place, viewer_from
 from list3r.queries.rooms import room_of, rooms_of
 from list3r.queries.views.gather import Gathered, gather, is_large, sample
@@ -36,6 +36,9 @@ _LOOK = 0.8
 _MOST_LABELLED = 1_000
 """Instances with all words of a question that are looked at for their label."""
 _HOLDING = ("on", "in", "attached_to")
+_COMMON = 5_000
+"""Instances of one name from which those near a place are looked for around it."""
+_NEAREST = "nothing fits; these are the nearest by "
 
 
 class Found(Matches):
@@ -157,7 +160,7 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
     if not any(_says_something(p) for p in question.phrases) and question.kind == "which":
         return Found((), ["say what to look for, such as: white mug on table"])
     if not best:
-        best = _nearest_by_meaning(store, question, encoder)
+        best = _nearest_by_meaning(store, question.phrases, encoder)
     ranked = sorted(best.values(), key=lambda c: (-c.score, -c.instance.confidence, c.instance.id))
     matches = [Match(c.instance, round(c.score, 4), None, None, _reason(c)) for c in ranked[:k]]
     out = Found(matches, notes, unknown, len(ranked))
@@ -170,7 +173,7 @@ def _asked(store: Store, question: Question, k: int, viewpoint: Place | None, en
         if equal > 1 and out.ambiguous and question.kind != "count":
             out.notes = (*out.notes, f"{equal} instances match equally well; add words to tell them apart")
     if not exact and ranked:
-        out.notes = (*out.notes, "nothing fits; these are the nearest by " + ("look" if by_look else "meaning"))
+        out.notes = (*out.notes, _NEAREST + ("look" if by_look else "meaning"))
     return out
 
 
@@ -219,14 +222,38 @@ def _placed(store: Store, m: Match) -> Match:
     return replace(m, reason="; ".join(parts))
 
 
-def _nearest_by_meaning(store: Store, question: Question, encoder: WordEncoder | None) -> dict[int, PhraseMatch]:
+def _nearest_by_meaning(store: Store, phrases: Iterable[Phrase], encoder: WordEncoder | None) -> dict[int, PhraseMatch]:
     """Return the nearest to what was asked for where nothing fits, with scores that say so."""
-    for phrase in question.phrases:
+    for phrase in phrases:
         for other, score, why in looser(phrase):
             found, search = meant(store, other, None, encoder)
             if found and not search.by_look:
                 return {c.instance.id: PhraseMatch(c.instance, c.score * score, (*c.reasons, why)) for c in found}
     return {}
+
+
+def named_by(
+    store: Store, words: str, filters: Filters, encoder: WordEncoder | None, notes: list[str]
+) -> list[tuple[Instance, float, str]]:
+    """Return what words mean that passes the filters, with how well and why, for `nearest`."""
+    phrases, found = [p for p in parse(words).phrases if _says_something(p)], dict[int, PhraseMatch]()
+    for phrase in phrases:
+        matches, search = meant(store, phrase, encoder=encoder)
+        notes += search.notes
+        for c in (c for c in matches if filters.passes(c.instance)):
+            found.setdefault(c.instance.id, c)
+    if not found:
+        nearest = _nearest_by_meaning(store, phrases, encoder)
+        found = {n: c for n, c in nearest.items() if filters.passes(c.instance)}
+        notes += [_NEAREST + "meaning"] if found else []
+    return [(c.instance, round(c.score, 4), _reason(c)) for c in found.values()]
+
+
+def only_common(store: Store, words: str) -> bool:
+    """Tell whether the words only name, and so many have them that it is better to look around than at all of them."""
+    if not is_large(store) or any(p != _plain(p) for p in parse(words).phrases):
+        return False
+    return len(store.words.bearing(wanted_words(words), _COMMON + 1)[0]) > _COMMON
 
 
 def _by_words_alone(store: Store, question: Question, k: int) -> Found | None:

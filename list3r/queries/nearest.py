@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
+from list3r.queries.finding.words import STRUCTURE, wanted_words
 from list3r.queries.match import (
     FilterOptions,
     Filters,
@@ -25,7 +26,6 @@ from list3r.queries.match import (
     of_one_state,
 )
 from list3r.queries.views.best_first import NearestSearch, box_gaps, nearest_first
-from list3r.queries.views.gather import is_large
 from list3r.queries.views.surfaces import STRAY, distance_between, distance_to_point, surface_of
 
 if TYPE_CHECKING:
@@ -46,14 +46,11 @@ def nearest(
 ) -> Matches:
     """Find the k instances nearest to a `point` (world) or to an instance, by the distance between surfaces.
 
-    With `words` only things whose label or description has one of them; with words alone those that they name best,
-    then the surest, without distances. The words must all be found where any thing has them all. Words that say more
-    than names (a relation, a size, an id: "small mug on the table") mean what they mean to `find`. Words that name a
-    kind of structure ("floor", "wall") ask for structure too. Words that no instance has are compared by the vectors of
-    an `encoder` whose space the memory holds. `max_distance` bounds the distance between
-    surfaces. What moves is taken where it was last seen; near an instance only what shares its component answers. For
-    the filters see `Filters`. Raises `OptionError` for arguments that make no sense and `UnknownIdError` for an id that
-    was never given.
+    With `words` only instances that they mean to `find`; with words alone the best of these, then the surest, without
+    distances. Words that name a kind of structure ("floor", "wall") ask for structure too. `max_distance` bounds the
+    distance between surfaces. What moves is taken where it was last seen; near an instance only what shares its
+    component answers. For the filters see `Filters`. Raises `OptionError` for arguments that make no sense and
+    `UnknownIdError` for an id that was never given.
     """
     k = checked_count(k)
     if point is not None and instance_id is not None:
@@ -69,16 +66,16 @@ def nearest(
     if words is None:
         near = _near(store, origin, place, k, max_distance, Filters.of(store, options))
         return Matches(_match(i, distance, "", origin, place) for distance, i in near)
-    from list3r.queries.by_words import named_by, names_structure, only_common
+    from list3r.queries.find import named_by, only_common
 
-    options["structure"] = options.get("structure", False) or names_structure(words)
+    options["structure"] = options.get("structure", False) or not STRUCTURE.isdisjoint(wanted_words(words))
     filters = Filters.of(store, options)
-    if is_large(store) and (origin is not None or place is not None) and only_common(store, words):
+    if (origin is not None or place is not None) and only_common(store, words):
         filters = replace(filters, label=" ".join([*([filters.label] if filters.label else []), words]))
         near = _near(store, origin, place, k, max_distance, filters)
         return Matches(_match(i, distance, f"named {words}", origin, place) for distance, i in near)
     notes: list[str] = []
-    named = named_by(store, words, origin, filters, encoder, notes)
+    named = named_by(store, words, filters, encoder, notes)
     if origin is None and place is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         best = (Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k])

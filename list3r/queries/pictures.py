@@ -236,7 +236,7 @@ def _views(store: Store, o: Observation, settings: PictureSettings) -> list[_Vie
 
 def _projected(store: Store, instance: Instance, settings: PictureSettings) -> InstancePicture:
     best: tuple[float, PosedCamera, int, Box, float] | None = None
-    for camera, chunk_id in store.derived.of(_PictureCameras).towards(store, instance, settings.projected_frames):
+    for camera, chunk_id in _cameras_towards(store, instance, settings.projected_frames):
         for s in look(store, camera, in_front(store, camera, None)):
             worth = s.visible * s.inside * min(1.0, s.picture**0.5)
             if s.instance.id == instance.id and (best is None or worth > best[0]):
@@ -252,44 +252,19 @@ def _projected(store: Store, instance: Instance, settings: PictureSettings) -> I
     return InstancePicture(instance.id, camera.session_id, camera.frame.frame_index, rgb, box, None, visible)
 
 
-class _PictureCameras:
-    """The cameras of posed keyframes whose picture is stored, kept while the memory stays as it is."""
-
-    def __init__(self) -> None:
-        self._stamp: tuple[int, int, int] | None = None
-        self._cameras: list[tuple[PosedCamera, int]] = []
-        """In the order of session and frame, with the chunk that keeps the picture."""
-        self._T_cam_world = np.zeros((0, 4, 4))
-        self._lenses = np.zeros((0, 4))
-        """fx, fy, cx, cy, px."""
-        self._sizes = np.zeros((0, 2))
-        """Height and width, px."""
-        self._components = np.zeros(0, np.int64)
-
-    def towards(self, store: Store, instance: Instance, most: int) -> list[tuple[PosedCamera, int]]:
-        """Return those of its component whose picture holds an instance's centre, the nearest first."""
-        if self._stamp != store.connection.stamp():
-            self._read(store)
-        x, y, z = (self._T_cam_world[:, :3, :3] @ instance.center + self._T_cam_world[:, :3, 3]).T
-        ahead = (z > 0) & (self._components == instance.component)
-        fx, fy, cx, cy = self._lenses.T
-        height, width = self._sizes.T
-        depth = np.where(ahead, z, 1.0)
-        u, v = fx * x / depth + cx, fy * y / depth + cy
-        chosen = np.flatnonzero(ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height))
-        nearest = chosen[np.argsort(z[chosen], kind="stable")[:most]]
-        return [self._cameras[k] for k in nearest.tolist()]
-
-    def _read(self, store: Store) -> None:
-        self._stamp = store.connection.stamp()
-        keeper: dict[tuple[int, int], int] = {}
-        for chunk in store.chunks.all():
-            for frame in store.keyframes.with_picture(chunk.chunk_id):
-                keeper.setdefault((chunk.session_id, frame), chunk.chunk_id)
-        cameras = cameras_of_frames(store, keeper) if keeper else []
-        self._cameras = [(c, keeper[c.session_id, c.frame.frame_index]) for c in cameras if c.frame is not None]
-        poses = np.array([c.T_world_cam for c in cameras]).reshape(-1, 4, 4)
-        self._T_cam_world = np.linalg.inv(poses)
-        self._lenses = np.array([c.intrinsics for c in cameras]).reshape(-1, 4)
-        self._sizes = np.array([c.image_size for c in cameras]).reshape(-1, 2)
-        self._components = np.array([c.component for c in cameras], np.int64)
+def _cameras_towards(store: Store, instance: Instance, most: int) -> list[tuple[PosedCamera, int]]:
+    """Return the cameras whose stored picture holds an instance's centre, the nearest first, each with the chunk that
+    keeps the picture.
+    """
+    keeper: dict[tuple[int, int], int] = {}
+    for chunk in (c for c in store.chunks.all() if c.component == instance.component):
+        for frame in store.keyframes.with_picture(chunk.chunk_id):
+            keeper.setdefault((chunk.session_id, frame), chunk.chunk_id)
+    found = []
+    for camera in cameras_of_frames(store, keeper) if keeper else ():
+        x, y, z = camera.T_world_cam[:3, :3].T @ (instance.center - camera.place)
+        (fx, fy, cx, cy), (height, width) = camera.intrinsics, camera.image_size
+        inside = z > 0 and 0 <= fx * x + cx * z < width * z and 0 <= fy * y + cy * z < height * z
+        if inside and camera.frame is not None:
+            found.append((z, camera, keeper[camera.session_id, camera.frame.frame_index]))
+    return [(camera, chunk) for _, camera, chunk in sorted(found, key=lambda f: float(f[0]))[:most]]

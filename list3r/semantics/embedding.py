@@ -43,7 +43,7 @@ class EmbedReport:
 
 
 @dataclass(frozen=True)
-class _View:
+class _BestView:
     instance: int
     frame: int
     box: tuple[float, ...]
@@ -154,21 +154,21 @@ def _weights(model: str, asked: str | None, licence: str) -> str:
     return resolve(asked, chosen, f"--model {model}")
 
 
-def _views(store: Store) -> dict[int, list[_View]]:
+def _views(store: Store) -> dict[int, list[_BestView]]:
     """The best views of every thing among the keyframes with a picture, by chunk."""
     owner: dict[int, dict[int, int]] = defaultdict(dict)
     for seen in store.observations.all():
         owner[seen.chunk_id][seen.local_id] = seen.instance_id
-    best: dict[int, list[tuple[int, _View]]] = defaultdict(list)
+    best: dict[int, list[tuple[int, _BestView]]] = defaultdict(list)
     for chunk_id, locals_ in sorted(owner.items()):
         frames = {k.frame_index for k in store.keyframes.of(chunk_id) if k.jpeg}
         for local_id, instance in sorted(locals_.items()):
             track = store.local_instances.mask_track(chunk_id, local_id)
             for row in np.flatnonzero(np.isin(track.frames, list(frames))).tolist():
                 area = float(track.areas_px[row]) * max(float(track.visible_fraction[row]), 0.05)
-                view = _View(instance, int(track.frames[row]), tuple(track.boxes_xyxy[row].tolist()), area)
+                view = _BestView(instance, int(track.frames[row]), tuple(track.boxes_xyxy[row].tolist()), area)
                 best[instance].append((chunk_id, view))
-    out: dict[int, list[_View]] = defaultdict(list)
+    out: dict[int, list[_BestView]] = defaultdict(list)
     for instance in sorted(best):
         for chunk_id, view in sorted(best[instance], key=lambda v: (-v[1].area, v[0], v[1].frame))[:VIEWS]:
             out[chunk_id].append(view)
@@ -176,12 +176,12 @@ def _views(store: Store) -> dict[int, list[_View]]:
 
 
 def _look(
-    store: Store, chunk_id: int, wanted: list[_View], model: PictureEncoder, sums: dict[int, NDArray[np.float64]]
+    store: Store, chunk_id: int, wanted: list[_BestView], model: PictureEncoder, sums: dict[int, NDArray[np.float64]]
 ) -> None:
     """Add the vectors of one chunk's views to those of their things."""
     from list3r.semantics.text_image import decode_jpeg, square_crop
 
-    by_frame: dict[int, list[_View]] = defaultdict(list)
+    by_frame: dict[int, list[_BestView]] = defaultdict(list)
     for view in wanted:
         by_frame[view.frame].append(view)
     for frame, views in sorted(by_frame.items()):

@@ -158,22 +158,8 @@ def suppressed(
     boxes_xyxy: NDArray[np.float32], scores: NDArray[np.float32], classes: NDArray[np.int64], most: float
 ) -> NDArray[np.int64]:
     """Boxes that stay, surest first: of two of one class that overlap by more than `most` (IoU) the surer does."""
-    order = np.lexsort((np.arange(len(scores)), -scores))
-    kept: list[int] = []
-    for k in order:
-        same = [j for j in kept if classes[j] == classes[k]]
-        if not same or overlaps(boxes_xyxy[k], boxes_xyxy[same]).max() <= most:
-            kept.append(int(k))
-    return np.array(kept, np.int64)
-
-
-def overlaps(box: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Intersection over union of a box (4,) with others. Shape (N, 4) -> (N,)."""
-    low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
-    shared = np.prod(np.clip(high - low, 0, None), axis=1)
-    areas = np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1)
-    own = float(np.prod(np.clip(box[2:] - box[:2], 0, None)))
-    return np.asarray(shared / np.maximum(areas + own - shared, 1e-9), np.float32)
+    corner_size = np.column_stack([boxes_xyxy[:, :2], boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]]).tolist()
+    return np.array(cv2.dnn.NMSBoxesBatched(corner_size, scores.tolist(), classes.tolist(), 0.0, most), np.int64)
 
 
 def _trained_side(param: Path) -> int:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from list3r.memory.core.description.coco import plausible
 from list3r.memory.core.records import Votes
 from list3r.memory.library.labels import PRIOR_ODDS
+from list3r.memory.library.overlap.pair_scores import box_iou
 from list3r.semantics.detector import Detections
 
 
@@ -133,13 +134,10 @@ def _can_be(name: str, thing: ThingInFrame) -> bool:
 
 def _fit(box: NDArray[np.float32], thing: ThingInFrame, s: VotingSettings) -> float:
     """How well a box and a thing fit, in [0, 1]; 0 for not at all."""
-    a, b = box.astype(np.float64), thing.box_xyxy.astype(np.float64)
-    low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
-    shared = float(np.prod(np.clip(high - low, 0, None)))
-    overlap = shared / max(float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - shared, 1e-9)
+    overlap = float(box_iou(box[None].astype(np.float64), thing.box_xyxy[None].astype(np.float64))[0, 0])
     if overlap < s.min_overlap:
         return 0.0
-    x0, y0, x1, y1 = (max(0, round(v)) for v in a.tolist())
+    x0, y0, x1, y1 = (max(0, round(v)) for v in box.tolist())
     inside = float(thing.mask[y0:y1, x0:x1].sum()) / max(float(thing.mask.sum()), 1.0)
     return min(1.0, overlap / s.full_overlap) * inside if inside >= s.min_inside else 0.0
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from list3r.api import SceneMemory
 from list3r.api import open as open_scene
 from list3r.memory.core.errors import List3rError
-from list3r.viewer.clouds import CloudSettings, PageClouds, Shown
+from list3r.viewer.clouds import CloudSettings, Drawing, PageClouds
 from list3r.viewer.instance_text import described
 from list3r.viewer.layers import Layers, LayerSettings
 from list3r.viewer.link import ViewState
@@ -55,7 +55,7 @@ class Viewer:
         """Whether another link was opened before that one's page connected."""
         self._measuring: list[tuple[int, NDArray[np.float64]]] | None = None
         self._pages: dict[int, PageClouds] = {}
-        self._drawn: Shown | None = None
+        self._drawn: Drawing | None = None
         self._listed: ShownWorld | None = None
         self.state = ViewState()
         self.path = read_path(memory)
@@ -135,7 +135,7 @@ class Viewer:
 
     def _draw_points(self) -> None:
         s = self.state
-        shown = Shown(self.world, s.colors, s.structure, s.points)
+        shown = Drawing(self.world, s.colors, s.structure, s.points)
         if not shown.same(self._drawn):
             self._drawn = shown
             counts = shown.allowed()

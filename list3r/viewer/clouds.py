@@ -43,7 +43,7 @@ class CloudSettings:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Drawing:
     """Drawn layers of a world."""
 
     world: ShownWorld = field(compare=False)
@@ -51,7 +51,7 @@ class Shown:
     structure: bool
     points: bool
 
-    def same(self, other: Shown | None) -> bool:
+    def same(self, other: Drawing | None) -> bool:
         """Whether another shows the same of the same world."""
         return other is not None and other.world is self.world and other == self
 
@@ -69,7 +69,7 @@ class PageClouds:
         self._client, self._settings, self.names = client, settings, names
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
-        self._shown: Shown | None = None
+        self._shown: Drawing | None = None
         self._detail_at: NDArray[np.float64] | None = None
         self._last_move = 0.0
         self._moving = False
@@ -87,7 +87,7 @@ class PageClouds:
         """How many points the page can show at rest."""
         return np.inf if self.seconds_a_point is None else self._settings.rest_s / max(self.seconds_a_point, 1e-12)
 
-    def draw(self, shown: Shown) -> None:
+    def draw(self, shown: Drawing) -> None:
         """Draw a world; the first time, the page's drawing speed is measured."""
         with self._lock:
             before, self._shown = self._shown, shown

@@ -54,9 +54,9 @@ def _guarded(asked_for: Callable[[str], None]) -> Iterator[None]:
             answer = process_request(connection, request)
             if answer is not None:
                 answer.headers["Content-Security-Policy"] = f"frame-ancestors http://{HOST}:*"
-            if set(request.headers.get_all("Sec-Fetch-Dest")) <= _PAGES:
-                for code in parse_qs(request.path.partition("?")[2]).get("view", [])[-1:]:
-                    asked_for(code)
+            codes = parse_qs(request.path.partition("?")[2]).get("view")
+            if codes and set(request.headers.get_all("Sec-Fetch-Dest")) <= _PAGES:
+                asked_for(codes[-1])
             return answer
 
         return serve(*args, **words, process_request=process)

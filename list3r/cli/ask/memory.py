@@ -10,8 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import AtOption, JsonOption, MemoryArgument, in_column, open_memory, print_table
+from list3r.cli.common import (
+    AtOption,
+    IdArgument,
+    JsonOption,
+    MemoryArgument,
+    MinConfidence,
+    in_column,
+    open_memory,
+    print_table,
+)
 from list3r.cli.terminal import note, say
+from list3r.memory.core.errors import check_share
 
 if TYPE_CHECKING:
     from list3r.memory.core.records import DetectedLabel, Instance, Relation
@@ -59,13 +69,7 @@ def info(
 def list_instances(
     memory: MemoryArgument,
     structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
-    min_confidence: Annotated[
-        float | None,
-        typer.Option(
-            "--min-confidence",
-            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
-        ),
-    ] = None,
+    min_confidence: MinConfidence = None,
     at: AtOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -73,17 +77,12 @@ def list_instances(
 
     Example: list3r list house.l3r --min-confidence 0.2
     """
-    from list3r.memory.core.errors import check_share
     from list3r.memory.core.records import FIRST_SCRAP, FIRST_UNLISTED
 
     least = min_confidence or 0.0
     check_share("--min-confidence", least)
-    with open_memory(memory, None if at is not None else min_confidence) as scene:
+    with open_memory(memory, None if at is not None else min_confidence, at) as scene:
         found: list[Instance] = scene.instances(structure=None if structure else False)
-        if at is not None:
-            from list3r.memory.library.maintenance.history import world_at
-
-            found = [i for i in world_at(scene.store, at) if structure or i.structure is None]
         units = scene.lengths
     kept = [i for i in found if i.confidence >= least]
     kinds, starts = ("", "low-confidence", "unsure"), (FIRST_SCRAP, FIRST_UNLISTED)
@@ -129,9 +128,7 @@ def _place(values: Any) -> str:
 
 def show(
     memory: MemoryArgument,
-    instance_id: Annotated[
-        int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
-    ],
+    instance_id: IdArgument,
     json: JsonOption = False,
 ) -> None:
     """Show one instance: where it is, how big, when it was seen, and its main relation to each other instance.

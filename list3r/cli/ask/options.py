@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from list3r.cli.common import parse_point
+from list3r.cli.common import MIN_CONFIDENCE, parse_point
+from list3r.memory.core.errors import OptionError
+from list3r.pipeline.request import option
+
+if TYPE_CHECKING:
+    from list3r.api import SceneMemory
+    from list3r.queries.match import FilterOptions
+    from list3r.queries.views.camera import PosedCamera
 
 OptionalId = Annotated[
     int | None, typer.Argument(metavar="[ID]", help="The instance, by any id it ever had.", show_default=False)
@@ -17,21 +26,6 @@ Catalogue = Annotated[
     typer.Option("--catalog", metavar="URL", help="Ask a catalogue; MEMORY is a name in it, or @all."),
 ]
 Count = Annotated[int, typer.Option("-k", help="Most answers to return.")]
-MinConfidence = Annotated[
-    float | None,
-    typer.Option(
-        "--min-confidence",
-        help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
-    ),
-]
-Structure = Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")]
-Label = Annotated[
-    str | None,
-    typer.Option("--label", metavar="WORDS", help="Only instances with one of these words in label or description."),
-]
-Color = Annotated[str | None, typer.Option("--color", metavar="COLOUR", help="Only instances of this colour.")]
-MinSize = Annotated[float | None, typer.Option("--min-size", help="Only instances with at least this longest edge.")]
-MaxSize = Annotated[float | None, typer.Option("--max-size", help="Only instances with at most this longest edge.")]
 State = Annotated[
     str | None,
     typer.Option(
@@ -44,21 +38,53 @@ Component = Annotated[int | None, typer.Option("--component", help="Only this co
 Room = Annotated[
     str | None, typer.Option("--room", metavar="ROOM", help="Only what is in this room: its number or name.")
 ]
-View = Annotated[
-    int | None, typer.Option("--view", metavar="FRAME", help="Only instances that the camera of this frame sees.")
-]
-Time = Annotated[
-    float | None,
-    typer.Option("--time", metavar="S", help="The camera of the posed frame nearest to this time, seconds."),
-]
-Pose = Annotated[
-    str | None,
-    typer.Option(
-        "--pose", metavar="X,Y,Z,QW,QX,QY,QZ", help="A camera at this position with this rotation (OpenCV axes)."
-    ),
-]
-Session = Annotated[int | None, typer.Option("--session", help="The session of the frame or camera.")]
-MaxDepth = Annotated[float | None, typer.Option("--max-depth", help="How far the camera sees.")]
+
+
+@dataclass(frozen=True)
+class Filtering:
+    """Which instances may answer."""
+
+    label: str | None = option(None, "Only instances with one of these words in label or description.", "WORDS")
+    color: str | None = option(None, "Only instances of this colour.", "COLOUR")
+    min_size: float | None = option(None, "Only instances with at least this longest edge.")
+    max_size: float | None = option(None, "Only instances with at most this longest edge.")
+    min_confidence: float | None = option(None, MIN_CONFIDENCE)
+    structure: bool = option(False, "Also floor, walls, ceiling.")
+
+    def filters(self) -> FilterOptions:
+        """Return the filters as the questions of Python take them."""
+        return {**vars(self), "min_confidence": self.min_confidence or 0.0}  # type: ignore[typeddict-item]
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The camera that a question looks from."""
+
+    view: int | None = option(None, "Only instances that the camera of this frame sees.", "FRAME")
+    time: float | None = option(None, "The camera of the posed frame nearest to this time, seconds.", "S")
+    pose: str | None = option(None, "A camera at this position with this rotation (OpenCV axes).", "X,Y,Z,QW,QX,QY,QZ")
+    session: int | None = option(None, "The session of the frame or camera.")
+    max_depth: float | None = option(None, "How far the camera sees.")
+
+    def camera(self, scene: SceneMemory) -> PosedCamera | None:
+        """Return the camera that is named; None for none. Raises `OptionError`."""
+        if sum(x is not None for x in (self.view, self.time, self.pose)) > 1:
+            raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
+        if self.view is None and self.time is None and self.pose is None:
+            if self.session is not None:
+                said = f"--session {self.session} needs a camera: --view FRAME, --time S or --pose"
+                raise OptionError(f"{said}; or leave it out")
+            return None
+        if self.pose is None:
+            return scene.camera(frame=self.view, time_s=self.time, session=self.session)
+        try:
+            values = [float(part) for part in self.pose.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != 7 or not all(math.isfinite(v) for v in values):
+            said = "give seven finite numbers separated by commas, x,y,z and w,x,y,z"
+            raise OptionError(f"--pose {self.pose!r}: {said}")
+        return scene.camera(position=values[:3], quat_wxyz=values[3:], session=self.session)
 
 
 def id_or_words(text: str | None) -> tuple[int | None, str | None]:
@@ -72,8 +98,6 @@ def region(
     box: str | None, point: str | None, radius: float | None, *, camera: bool
 ) -> dict[str, Sequence[float] | float]:
     """Return a box or a sphere, nothing for what a camera sees. Raises `OptionError` unless there is one of them."""
-    from list3r.memory.core.errors import OptionError
-
     sphere = point is not None or radius is not None
     if (box is not None) + sphere + camera > 1:
         raise OptionError("give one region: --box, --point with --radius, --view or --pose")
@@ -92,8 +116,6 @@ def region(
 
 def corners(box: str | None) -> tuple[float, float, float, float] | None:
     """Return the box `120,80,180,150` of a picture, px. Raises `OptionError`."""
-    from list3r.memory.core.errors import OptionError
-
     if box is None:
         return None
     try:

@@ -1,8 +1,7 @@
-"""What the questions print, and the camera that their options name."""
+"""What the questions print."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from list3r.cli.answer import print_answer
@@ -18,35 +17,6 @@ if TYPE_CHECKING:
     from list3r.memory.library.world.scale import Lengths
     from list3r.queries.match import Match
     from list3r.queries.relations import Relations
-    from list3r.queries.views.camera import PosedCamera
-
-
-def camera_from(
-    scene: SceneMemory,
-    *,
-    view: int | None = None,
-    time: float | None = None,
-    pose: str | None = None,
-    session: int | None = None,
-) -> PosedCamera | None:
-    """The camera that the options name; None for none of them. Raises `OptionError`."""
-    from list3r.memory.core.errors import OptionError
-
-    if sum(option is not None for option in (view, time, pose)) > 1:
-        raise OptionError("name one camera: --view FRAME, --time S or --pose X,Y,Z,QW,QX,QY,QZ")
-    if view is None and time is None and pose is None:
-        if session is not None:
-            raise OptionError(f"--session {session} needs a camera: --view FRAME, --time S or --pose; or leave it out")
-        return None
-    if pose is None:
-        return scene.camera(frame=view, time_s=time, session=session)
-    try:
-        values = [float(part) for part in pose.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 7 or not all(math.isfinite(v) for v in values):
-        raise OptionError(f"--pose {pose!r}: give seven finite numbers separated by commas, x,y,z and w,x,y,z")
-    return scene.camera(position=values[:3], quat_wxyz=values[3:], session=session)
 
 
 def match_dict(match: Match) -> dict[str, Any]:

@@ -8,15 +8,14 @@ from typing import Annotated
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory
+from list3r.cli.common import IdArgument, JsonOption, MemoryArgument, open_memory
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 
 
 def picture(
     memory: MemoryArgument,
-    instance_id: Annotated[
-        int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
-    ],
+    instance_id: IdArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default: instance_ID.jpg.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="The whole frame with its outline instead of a crop.")] = False,
     json: JsonOption = False,
@@ -28,7 +27,6 @@ def picture(
     from PIL import Image
 
     from list3r.exporters.output import replacing
-    from list3r.memory.core.errors import OptionError
 
     out = out or Path(f"instance_{instance_id}.jpg")
     if out.suffix.lower() not in (".jpg", ".jpeg", ".png"):

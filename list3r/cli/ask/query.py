@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.ask import options as opt
-from list3r.cli.ask.output import camera_from, print_matches, print_relations
+from list3r.cli.ask.output import print_matches, print_relations
 from list3r.cli.catalog import questions as many
 from list3r.cli.common import AtOption, JsonOption, MemoryArgument, open_memory, parse_point, print_table
 from list3r.cli.terminal import note, say
-
-if TYPE_CHECKING:
-    from list3r.queries.match import FilterOptions
+from list3r.memory.core.errors import OptionError
 
 
 def find(
+    context: typer.Context,
     memory: MemoryArgument,
     text: Annotated[
         str,
@@ -38,7 +37,7 @@ def find(
     Example: list3r find house.l3r "how many chairs are next to the table?"
     """
     if catalog is not None:
-        many.refuse({"--from": viewpoint, "--at": at})
+        many.only_these(context, "text", "k")
         many.answer(catalog, memory, lambda c, name: c.find(text, name, k=k, filters=many.filters()), json)
         return
     with open_memory(memory, at=at) as scene:
@@ -49,6 +48,7 @@ def find(
 
 
 def nearest(
+    context: typer.Context,
     memory: MemoryArgument,
     what: Annotated[
         str | None,
@@ -63,15 +63,11 @@ def nearest(
     max_distance: Annotated[
         float | None, typer.Option("--max-distance", help="Only instances whose surface is at most this far away.")
     ] = None,
-    label: opt.Label = None,
-    color: opt.Color = None,
-    min_size: opt.MinSize = None,
-    max_size: opt.MaxSize = None,
-    min_confidence: opt.MinConfidence = None,
+    *,
+    look: opt.Filtering,
     state: opt.State = None,
     component: opt.Component = None,
     room: opt.Room = None,
-    structure: opt.Structure = False,
     catalog: opt.Catalogue = None,
     at: AtOption = None,
     json: JsonOption = False,
@@ -80,21 +76,16 @@ def nearest(
 
     Example: list3r nearest house.l3r 12 -k 3
     """
-    from list3r.memory.core.errors import OptionError
-
     if what is None and point is None:
         raise OptionError("give a place: an ID, --point x,y,z, or words such as mug")
     instance_id, words = opt.id_or_words(what)
     place = None if point is None else parse_point(point, "--point")
     if catalog is not None:
-        many.refuse({"--max-distance": max_distance, "--component": component, "--room": room, "--at": at})
-        many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size})
-        chosen = many.filters(min_confidence, structure=structure, state=state)
+        many.only_these(context, "what", "point", "k", "min_confidence", "structure", "state")
+        chosen = many.filters(look.min_confidence, structure=look.structure, state=state)
         many.answer(catalog, memory, lambda c, name: many.nearest(c, name, instance_id, place, words, k, chosen), json)
         return
-    of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
-    of_look |= {"state": state, "component": component, "room": room}
-    with open_memory(memory, min_confidence, at) as scene:
+    with open_memory(memory, look.min_confidence, at) as scene:
         from list3r.queries.nearest import nearest as ask
 
         matches = ask(
@@ -105,29 +96,26 @@ def nearest(
             k=k,
             max_distance=max_distance,
             encoder=None if words is None else scene.word_encoder(),
-            **of_look,
+            state=state,
+            component=component,
+            room=room,
+            **look.filters(),
         )
         print_matches(matches, scene.lengths, json)
 
 
 def within(
+    context: typer.Context,
     memory: MemoryArgument,
     box: Annotated[
         str | None, typer.Option("--box", metavar="X,Y,Z,X,Y,Z", help="Lower and upper corner of a box.")
     ] = None,
     point: Annotated[str | None, typer.Option("--point", metavar="X,Y,Z", help="Centre of a sphere.")] = None,
     radius: Annotated[float | None, typer.Option("--radius", help="Radius of the sphere.")] = None,
-    view: opt.View = None,
-    pose: opt.Pose = None,
-    session: opt.Session = None,
-    max_depth: opt.MaxDepth = None,
+    *,
+    seen_by: Annotated[opt.CameraOptions, "view", "pose", "session", "max_depth"],
     occlusion: Annotated[bool, typer.Option(help="Leave out instances that others hide from the camera.")] = True,
-    label: opt.Label = None,
-    color: opt.Color = None,
-    min_size: opt.MinSize = None,
-    max_size: opt.MaxSize = None,
-    min_confidence: opt.MinConfidence = None,
-    structure: opt.Structure = False,
+    look: opt.Filtering,
     catalog: opt.Catalogue = None,
     at: AtOption = None,
     json: JsonOption = False,
@@ -136,22 +124,20 @@ def within(
 
     Example: list3r within house.l3r --point 0,0,1 --radius 0.5
     """
-    region: dict[str, Any] = opt.region(box, point, radius, camera=view is not None or pose is not None)
+    region: dict[str, Any] = opt.region(box, point, radius, camera=seen_by.view is not None or seen_by.pose is not None)
     if catalog is not None:
-        many.refuse({"--view": view, "--pose": pose, "--session": session, "--max-depth": max_depth, "--at": at})
-        many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size})
-        many.refuse({"--no-occlusion": not occlusion})
-        chosen = many.filters(min_confidence, structure=structure)
+        many.only_these(context, "box", "point", "radius", "min_confidence", "structure")
+        chosen = many.filters(look.min_confidence, structure=look.structure)
         many.answer(catalog, memory, lambda c, name: c.within(many.one(name), **region, filters=chosen), json)
         return
-    of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
-    with open_memory(memory, min_confidence, at) as scene:
-        camera = camera_from(scene, view=view, pose=pose, session=session)
-        found = scene.within(**region, camera=camera, max_depth=max_depth, occlusion=occlusion, **of_look)
+    with open_memory(memory, look.min_confidence, at) as scene:
+        camera, far = seen_by.camera(scene), seen_by.max_depth
+        found = scene.within(**region, camera=camera, max_depth=far, occlusion=occlusion, **look.filters())
         print_matches(found, scene.lengths, json, total=len(found))
 
 
 def relations(
+    context: typer.Context,
     memory: MemoryArgument,
     subject: Annotated[
         str | None,
@@ -194,7 +180,7 @@ def relations(
     Example: list3r relations house.l3r mug --predicate on --object table
     """
     if catalog is not None:
-        many.refuse({"--and": other, "--from": viewpoint, "--at": at})
+        many.only_these(context, "subject", "predicate", "object", "min_confidence")
         members = {"subject": subject, "predicate": predicate, "object": object}
         many.answer_relations(catalog, memory, members, min_confidence, json)
         return
@@ -211,6 +197,7 @@ def relations(
 
 
 def similar(
+    context: typer.Context,
     memory: MemoryArgument,
     instance_id: opt.OptionalId = None,
     image: Annotated[Path | None, typer.Option("--image", metavar="FILE", help="Compare with this picture.")] = None,
@@ -218,12 +205,8 @@ def similar(
         str | None, typer.Option("--box", metavar="X0,Y0,X1,Y1", help="Only the part of the picture in this box, px.")
     ] = None,
     k: opt.Count = 5,
-    label: opt.Label = None,
-    color: opt.Color = None,
-    min_size: opt.MinSize = None,
-    max_size: opt.MaxSize = None,
-    min_confidence: opt.MinConfidence = None,
-    structure: opt.Structure = False,
+    *,
+    look: opt.Filtering,
     catalog: opt.Catalogue = None,
     everywhere: Annotated[
         bool, typer.Option("--everywhere", help="With --catalog: compare with the instances of all memories.")
@@ -235,37 +218,31 @@ def similar(
 
     Example: list3r similar house.l3r --image mug.jpg --box 120,80,180,150
     """
-    from list3r.memory.core.errors import OptionError
-
     corners = opt.corners(box)
     if catalog is not None:
-        many.refuse({"--label": label, "--color": color, "--min-size": min_size, "--max-size": max_size, "--at": at})
-        chosen, like = many.filters(min_confidence, structure=structure), (instance_id, image, corners)
+        many.only_these(context, "instance_id", "image", "box", "k", "min_confidence", "structure", "everywhere")
+        chosen, like = many.filters(look.min_confidence, structure=look.structure), (instance_id, image, corners)
         many.answer(catalog, memory, lambda c, name: many.similar(c, name, like, k, chosen, everywhere), json)
         return
     if everywhere:
         raise OptionError("--everywhere needs --catalog URL")
     if (instance_id is None) == (image is None) or (box is not None and image is None):
         raise OptionError("give a query: an ID, or --image FILE, with --box for a part of it")
-    of_look = _filters(label, color, min_size, max_size, min_confidence, structure)
-    with open_memory(memory, min_confidence, at) as scene:
+    with open_memory(memory, look.min_confidence, at) as scene:
         if image is not None:
-            found = scene.similar_to_picture(image, k, box_xyxy=corners, **of_look)
+            found = scene.similar_to_picture(image, k, box_xyxy=corners, **look.filters())
         else:
             assert instance_id is not None
-            found = scene.similar(instance_id, k=k, **of_look)
+            found = scene.similar(instance_id, k=k, **look.filters())
         print_matches(found, scene.lengths, json)
 
 
 def seen(
     memory: MemoryArgument,
     instance_id: Annotated[int | None, typer.Argument(metavar="[ID]", help="When this instance was seen.")] = None,
-    time: opt.Time = None,
-    view: opt.View = None,
-    pose: opt.Pose = None,
-    session: opt.Session = None,
-    max_depth: opt.MaxDepth = None,
-    structure: opt.Structure = False,
+    *,
+    seen_by: opt.CameraOptions,
+    structure: Annotated[bool, typer.Option("--structure", help="Also floor, walls, ceiling.")] = False,
     at: AtOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -273,10 +250,8 @@ def seen(
 
     Example: list3r seen house.l3r --time 12.5
     """
-    from list3r.memory.core.errors import OptionError
-
     with open_memory(memory, at=at) as scene:
-        camera = camera_from(scene, view=view, time=time, pose=pose, session=session)
+        camera, max_depth = seen_by.camera(scene), seen_by.max_depth
         if (camera is None) == (instance_id is None):
             raise OptionError("name an instance by its id, or a camera: --time S, --view FRAME or --pose")
         if camera is None and max_depth is not None:
@@ -331,22 +306,3 @@ def path(
     with open_memory(memory, at=at) as scene:
         found = scene.path_between(start, end, structure=structure)
         print_relations(scene, found, json)
-
-
-def _filters(
-    label: str | None,
-    color: str | None,
-    min_size: float | None,
-    max_size: float | None,
-    min_confidence: float | None,
-    structure: bool,
-) -> FilterOptions:
-    """Return the filters as the questions of Python take them."""
-    return {
-        "label": label,
-        "color": color,
-        "min_size": min_size,
-        "max_size": max_size,
-        "min_confidence": min_confidence or 0.0,
-        "structure": structure,
-    }

@@ -9,6 +9,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import AtOption, JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -34,7 +35,6 @@ def rooms(
     Example: list3r rooms house.l3r --name "2=guest room"
     """
     from list3r.api import open as open_scene
-    from list3r.memory.core.errors import OptionError
 
     if name is not None:
         room, found, text = name.partition("=")

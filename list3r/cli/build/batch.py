@@ -11,66 +11,44 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.common import JsonOption, only, print_table, spread
+from list3r.cli.common import JsonOption, print_table
 from list3r.cli.terminal import note, write
-from list3r.pipeline.request import BuildRequest, RunOptions
+from list3r.memory.core.errors import OptionError
+from list3r.pipeline.request import BuildRequest, RunOptions, option
 
 if TYPE_CHECKING:
     from list3r.batch.runner import BatchReport
     from list3r.batch.tasks import BatchTask
     from list3r.batch.work import Outcome
 
-_RUN = only("licence", "scale_anchor", "detector", "detector_classes")
-
 
 @dataclass(frozen=True)
 class BatchPlace:
     """Where the tasks of a batch run, as options."""
 
-    engine: Annotated[str, typer.Option("--engine", metavar="local|ray", help="Engine that runs the tasks.")] = "local"
-    address: Annotated[
-        str | None,
-        typer.Option("--address", metavar="ADDRESS", help="Address of the Ray cluster; default: RAY_ADDRESS."),
-    ] = None
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", help="Tasks at the same time; default: as many as fit.")
-    ] = None
-    cpus: Annotated[int, typer.Option("--cpus", metavar="N", help="Cores of one task.")] = 1
-    task_memory: Annotated[
-        float | None, typer.Option("--task-memory", metavar="GIB", help="Memory of one task; default: not counted.")
-    ] = None
-    gpus: Annotated[float, typer.Option("--gpus", metavar="N", help="GPUs of one task, or a share of one.")] = 0.0
-    retries: Annotated[
-        int, typer.Option("--retries", metavar="N", help="How often a task is repeated after its process was killed.")
-    ] = 3
-    scratch: Annotated[
-        Path | None,
-        typer.Option("--scratch", metavar="DIR", help="Folder on each machine's own disk for unfinished memories."),
-    ] = None
-    state: Annotated[
-        Path | None,
-        typer.Option(
-            "--state", metavar="FILE", help="File with the state of every task; default: batch.sqlite in --out."
-        ),
-    ] = None
+    engine: str = option("local", "Engine that runs the tasks.", "local|ray")
+    address: str | None = option(None, "Address of the Ray cluster; default: RAY_ADDRESS.", "ADDRESS")
+    jobs: int | None = option(None, "Tasks at the same time; default: as many as fit.", "N")
+    cpus: int = option(1, "Cores of one task.", "N")
+    task_memory: float | None = option(None, "Memory of one task; default: not counted.", "GIB")
+    gpus: float = option(0.0, "GPUs of one task, or a share of one.", "N")
+    retries: int = option(3, "How often a task is repeated after its process was killed.", "N")
+    scratch: Path | None = option(None, "Folder on each machine's own disk for unfinished memories.", "DIR")
+    state: Path | None = option(None, "File with the state of every task; default: batch.sqlite in --out.", "FILE")
 
 
 @dataclass(frozen=True)
 class BatchTasks:
     """Options of the tasks."""
 
-    element: Annotated[
-        int | None, typer.Option("--only", metavar="N", help="Only the N-th memory, from 0, in this process.")
-    ] = None
-    script: Annotated[
-        str | None,
-        typer.Option("--print", metavar="WHAT", help="Print a script instead of building: slurm, an array job."),
-    ] = None
-    onto: Annotated[bool, typer.Option("--onto", help="Add videos to memories that no batch made.")] = False
-    force: Annotated[bool, typer.Option("--force", help="Replace memories of other videos or settings.")] = False
+    element: int | None = option(None, "Only the N-th memory, from 0, in this process.", "N", flag="--only")
+    script: str | None = option(
+        None, "Print a script instead of building: slurm, an array job.", "WHAT", flag="--print"
+    )
+    onto: bool = option(False, "Add videos to memories that no batch made.")
+    force: bool = option(False, "Replace memories of other videos or settings.")
 
 
-@spread
 def batch(
     videos: Annotated[
         str,
@@ -84,7 +62,7 @@ def batch(
     tasks: BatchTasks,
     request: BuildRequest,
     given: src.SourceArguments,
-    run: Annotated[RunOptions, _RUN],
+    run: Annotated[RunOptions, "licence", "scale_anchor", "detector", "detector_classes"],
     json: JsonOption = False,
 ) -> None:
     """Build the memories of many videos, one task per video. Running it again does only what is not done yet.
@@ -96,7 +74,6 @@ def batch(
     from list3r.batch.engines.choice import make_engine
     from list3r.batch.runner import BatchSettings, run_batch, run_here
     from list3r.batch.slurm import slurm_script
-    from list3r.memory.core.errors import OptionError
     from list3r.pipeline.finishing import check_run
 
     check_run(run)

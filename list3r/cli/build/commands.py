@@ -9,16 +9,16 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.build.build_options import BuildOptions
 from list3r.cli.build.progress import build_interrupted, report_lines, say_result, watching
-from list3r.cli.common import JsonOption, spread
+from list3r.cli.common import JsonOption
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
+from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import BuildReport
 
 
-@spread
 def inspect(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
@@ -66,7 +66,6 @@ def inspect(
 def _check_overlay(overlay: Path, source: Path) -> None:
     """Raises `OptionError` or `ExportError` before any work where the picture cannot or must not be written."""
     from list3r.exporters.output import check_target
-    from list3r.memory.core.errors import OptionError
 
     if overlay.suffix.lower() != ".png":
         raise OptionError(f"--overlay {overlay}: the picture must end in .png")
@@ -75,13 +74,14 @@ def _check_overlay(overlay: Path, source: Path) -> None:
         raise OptionError(f"--overlay {overlay} is a picture of the source itself; name another file")
 
 
-@spread
 def build(
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
     memory: Annotated[Path, typer.Option("-m", "--memory", metavar="MEMORY", help="The memory file to write.")],
-    asked: BuildOptions,
+    request: BuildRequest,
+    given: src.SourceArguments,
+    run: RunOptions,
     debug: Annotated[
         Path | None,
         typer.Option("--debug", metavar="DIR", help="Write pictures of masks, tracks and loops to this folder."),
@@ -92,12 +92,12 @@ def build(
 
     Example: list3r build walk/ -m house.l3r
     """
-    options = asked.given.options(more)
+    options = given.options(more)
     from list3r.pipeline.live import build_any
 
     def work() -> BuildReport:
-        with watching("building", build_interrupted(memory, asked.run.resume), quiet=json, debug=debug) as watch:
-            return build_any(source, memory, options=options, settings=asked.request, run=asked.run, watch=watch)
+        with watching("building", build_interrupted(memory, run.resume), quiet=json, debug=debug) as watch:
+            return build_any(source, memory, options=options, settings=request, run=run, watch=watch)
 
     say_result(memory, work, report_lines, json)
 
@@ -106,9 +106,9 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the walk, the memory and the exports.")
     ] = Path("list3r-demo"),
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the random rooms.")] = 1,
-    frames: Annotated[int, typer.Option("--frames", help="Length of the walk, frames.")] = 300,
-    workers: Annotated[int | None, typer.Option("--workers", metavar="N", help="Worker processes.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random rooms.")] = 1,
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Length of the walk, frames.")] = 300,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, metavar="N", help="Worker processes.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Simulate a walk through two furnished rooms, build its memory, ask it, export it. Nothing is downloaded.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,6 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
     """Make `out/walk`, `out/rooms.l3r` and the exports next to it; returns the results, for JSON."""
     from list3r.pipeline.target import make_folder
 
-    for name, value, least in (("seed", seed, 0), ("frames", frames, 2), ("workers", workers, 1)):
-        if value is not None and value < least:
-            raise OptionError(f"--{name} {value}: at least {least} is needed")
     make_folder(out)
     walk, memory = out / "walk", out / "rooms.l3r"
     _print(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
@@ -72,8 +70,6 @@ def _render(walk: Path, *, seed: int, frames: int | None, workers: int | None, q
 
 def _remove_unfinished(walk: Path) -> None:
     """Delete leftovers of an interrupted demo: only files and folders that the simulation writes."""
-    import shutil
-
     for name in ("rgb", "depth", "ids"):
         shutil.rmtree(walk / name, ignore_errors=True)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt", "truth.json"):

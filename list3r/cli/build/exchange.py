@@ -9,7 +9,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
-from list3r.cli.common import JsonOption, spread
+from list3r.cli.common import JsonOption
 from list3r.cli.terminal import say
 from list3r.memory.core.errors import OptionError
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from list3r.reconstruction.outputs.base import OutputOptions
 
 
-@spread
 def convert(
     source: src.SourceArgument,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write; it must not exist.")],

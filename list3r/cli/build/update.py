@@ -6,28 +6,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from list3r.cli.build import source_options as src
-from list3r.cli.build.build_options import BuildOptions
 from list3r.cli.build.progress import say_result, watching
-from list3r.cli.common import JsonOption, MemoryArgument, spread
+from list3r.cli.common import JsonOption, MemoryArgument
+from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
     from list3r.pipeline.reports import UpdateReport
 
 
-@spread
 def update(
     memory: MemoryArgument,
     source: src.SourceArgument,
     more: src.MoreArgument = None,
     *,
-    asked: BuildOptions,
+    request: BuildRequest,
+    given: src.SourceArguments,
+    run: RunOptions,
     json: JsonOption = False,
 ) -> None:
     """Add a later video to a memory: place it in the same world, and record changes.
 
     Example: list3r update house.l3r walk-2/
     """
-    options = asked.given.options(more)
+    options = given.options(more)
     from list3r.pipeline.update import update as update_memory
 
     def interrupted(begun: bool) -> str:
@@ -35,7 +36,7 @@ def update(
 
     def work() -> UpdateReport:
         with watching("updating", interrupted, quiet=json) as watch:
-            return update_memory(memory, source, options=options, settings=asked.request, run=asked.run, watch=watch)
+            return update_memory(memory, source, options=options, settings=request, run=run, watch=watch)
 
     say_result(memory, work, report_lines, json)
 

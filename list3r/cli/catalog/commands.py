@@ -12,6 +12,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, print_table
 from list3r.cli.terminal import note, say
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.catalog import Catalog
@@ -47,8 +48,6 @@ def add(
 
     Example: list3r catalog add memories/ --catalog postgresql://db.example/list3r
     """
-    from list3r.memory.core.errors import OptionError
-
     found = list(_memories(files))
     if name is not None and len(found) != 1:
         raise OptionError(f"--name {name} names one memory, but {len(found)} are given")
@@ -150,8 +149,6 @@ def _opened(url: str, *, make: bool = False) -> Catalog:
 
 def _memories(files: Sequence[str]) -> Iterator[str]:
     """Yield memory files, those in folders too. Raises `OptionError` for a folder without any."""
-    from list3r.memory.core.errors import OptionError
-
     for file in files:
         if "://" in file or not Path(file).is_dir():
             yield file

@@ -21,11 +21,12 @@ ALL = "@all"
 _MOST_RELATIONS = 1000
 
 
-def refuse(options: dict[str, object]) -> None:
-    """Raise `OptionError` for options that are given and that only a file can answer."""
-    for flag, value in options.items():
-        if value is not None and value is not False:
-            raise OptionError(f"{flag} is not available for a catalogue; leave it out, or ask the memory file")
+def only_these(context: Any, *names: str) -> None:
+    """Raise `OptionError` for options that are given and that only a file can answer; `names` may be given."""
+    for p in context.command.params:
+        source = context.get_parameter_source(p.name)
+        if p.name not in (*names, "memory", "catalog", "json") and source is not None and source.name == "COMMANDLINE":
+            raise OptionError(f"{p.opts[-1]} is not available for a catalogue; leave it out, or ask the memory file")
 
 
 def filters(least: float | None = None, *, structure: bool = False, state: str | None = None) -> CatalogFilters:

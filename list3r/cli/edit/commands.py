@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.common import IdArgument, JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
     from list3r.memory.library.maintenance.edits import EditReport
 
-IdArgument = Annotated[
-    int, typer.Argument(metavar="ID", help="The instance, by any id it ever had.", show_default=False)
-]
 AuthorOption = Annotated[str | None, typer.Option("--author", metavar="NAME", help="Author of the edit; default: you.")]
 
 
@@ -198,8 +196,6 @@ def _run_edit(path: Path, verb: Callable[[SceneMemory], EditReport], json: bool)
 
 def _parse_parts(text: str) -> list[tuple[int, int]]:
     """`3:4,5:2` as pairs. Raises `OptionError`."""
-    from list3r.memory.core.errors import OptionError
-
     try:
         pairs = [part.split(":") for part in text.split(",")]
         return [(int(chunk), int(local)) for chunk, local in pairs]

@@ -14,9 +14,10 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, open_memory
+from list3r.cli.common import JsonOption, MemoryArgument, MinConfidence, open_memory
 from list3r.cli.terminal import note, say
 from list3r.exporters.registry import FORMATS, find_format
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -28,8 +29,6 @@ _FORMAT_OPTION = typer.Option(
 
 
 def _ids(text: str) -> tuple[int, ...]:
-    from list3r.memory.core.errors import OptionError
-
     if not all(word.strip().isdecimal() for word in text.split(",")):
         raise OptionError(f"--ids {text}: give numbers separated by commas, such as 3,7,12")
     return tuple(map(int, text.split(",")))
@@ -81,13 +80,7 @@ def export(
         int | None,
         typer.Option("--workers", metavar="N", help="simready: worker processes; 0: work in this process."),
     ] = None,
-    min_confidence: Annotated[
-        float | None,
-        typer.Option(
-            "--min-confidence",
-            help="Everything with at least this confidence, also low-confidence segments (default: not listed).",
-        ),
-    ] = None,
+    min_confidence: MinConfidence = None,
     json: JsonOption = False,
 ) -> None:
     """Write a memory in another format: scene JSON, USD, points, boxes, trajectory, tables, graphs, plan, an HTML
@@ -95,8 +88,6 @@ def export(
 
     Example: list3r export house.l3r --to usd --out house.usdc
     """
-    from list3r.memory.core.errors import OptionError
-
     asked: dict[str, Any] = {
         "color": color,
         "tokens": tokens,
@@ -139,8 +130,6 @@ def _size_text(size: int) -> str:
 
 def _pipe(scene: SceneMemory, to: str, options: dict[str, Any]) -> None:
     """Write the first file of a format to standard output, once it is whole. Raises `OptionError` for a folder."""
-    from list3r.memory.core.errors import OptionError
-
     form = find_format(to)
     if form.folder:
         raise OptionError(f"{to} writes a folder, which cannot go to standard output; name one with --out")

@@ -10,6 +10,7 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import MemoryFileError
 
 
 def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
@@ -17,8 +18,6 @@ def verify(memory: MemoryArgument, json: JsonOption = False) -> None:
 
     Example: list3r verify house.l3r
     """
-    from list3r.memory.core.errors import MemoryFileError
-
     found, state, chunks, leftovers = [], [], None, None
     try:
         with open_memory(memory) as scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,16 +16,16 @@ from list3r.cli.measure.options import (
     Estimate,
     EveryOption,
     PlotOption,
+    Scale,
     ScaleOption,
     Truth,
-    check_every,
     check_plot,
-    check_scale,
     free_scale,
     save_picture,
 )
 from list3r.cli.terminal import say
 from list3r.exporters.output import is_database
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,8 +73,6 @@ def cloud(
     from list3r.evaluation.cloud import cloud_distances, evaluate_cloud
     from list3r.evaluation.point_clouds import thinned
 
-    check_scale(scale)
-    check_every(every)
     check_plot(plot)
     _check_lengths(threshold=threshold, truncate=truncate)
     found, _ = read_points(estimate)
@@ -130,14 +129,13 @@ def _figure(
 
 def _cloud_alignment(
     align: list[str] | None,
-    scale: str,
+    scale: Scale,
     truth: tuple[PointCloud, Trajectory | None, Path],
     estimate: tuple[PointCloud, Path],
 ) -> tuple[Sim3, str]:
     """S_truth_estimate, and how it was found."""
     from list3r.evaluation.icp import IcpSettings, register
     from list3r.evaluation.scene import alignment_of
-    from list3r.memory.core.errors import OptionError
     from list3r.memory.core.geometry import Sim3
 
     (true, true_path, source), (found, estimate_path) = truth, estimate
@@ -171,10 +169,6 @@ def _normals(points: PointCloud) -> Any:
 
 
 def _check_lengths(**lengths: float | None) -> None:
-    import math
-
-    from list3r.memory.core.errors import OptionError
-
     for name, value in lengths.items():
         if value is not None and not (math.isfinite(value) and value > 0):
             raise OptionError(f"--{name} {value:g}: give a length above 0, in metres")

@@ -16,9 +16,7 @@ from list3r.cli.measure.options import (
     PlotOption,
     ScaleOption,
     Truth,
-    check_every,
     check_plot,
-    check_scale,
     free_scale,
     save_picture,
     share,
@@ -26,6 +24,7 @@ from list3r.cli.measure.options import (
 from list3r.cli.measure.revisits import revisits
 from list3r.cli.terminal import say
 from list3r.exporters.output import is_database
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,16 +43,9 @@ def trajectory(
         str, typer.Option("--delta", help="Distance between the poses that RPE compares: 10 (frames), 0.5m or 2s.")
     ] = "1",
     tolerance: Annotated[
-        float, typer.Option("--tolerance", help="Largest time difference of associated poses, seconds.")
+        float, typer.Option("--tolerance", min=0.0, help="Largest time difference of associated poses, seconds.")
     ] = 0.01,
-    scale: Annotated[
-        str,
-        typer.Option(
-            "--scale",
-            metavar="auto|free|fixed",
-            help="Alignment in the picture; auto: free for a memory of relative scale.",
-        ),
-    ] = "auto",
+    scale: ScaleOption = "auto",
     plot: PlotOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -62,12 +54,8 @@ def trajectory(
     Example: list3r eval trajectory walk/groundtruth.txt house.l3r --delta 1m --plot path.png
     """
     from list3r.evaluation.trajectory import Delta, evaluate_trajectory
-    from list3r.memory.core.errors import OptionError
 
-    check_scale(scale)
     check_plot(plot)
-    if not tolerance >= 0:
-        raise OptionError(f"--tolerance {tolerance:g}: give 0 or more seconds")
     apart = Delta.parse(delta)
     true, found = read_trajectory(truth), read_trajectory(estimate)
     errors = evaluate_trajectory(true, found, tolerance, delta=apart)
@@ -127,7 +115,7 @@ def instances(
             help="Folder with images of true ids, to count the id switches of a memory. Default: ids/ next to TRUTH.",
         ),
     ] = None,
-    every: Annotated[int, typer.Option("--every", metavar="N", help="Compare ids in every N-th frame.")] = 1,
+    every: Annotated[int, typer.Option("--every", min=1, metavar="N", help="Compare ids in every N-th frame.")] = 1,
     plot: PlotOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -137,13 +125,10 @@ def instances(
     Example: list3r eval instances walk/truth.json rooms.l3r --plot found.png
     """
     from list3r.evaluation.scene import evaluate_scene, read_scene
-    from list3r.memory.core.errors import OptionError
 
     if align not in (None, "none") and estimate.is_file() and not is_database(estimate):
         raise OptionError(f"--align {align} aligns a memory; {estimate} is not one and has no camera path")
-    check_scale(scale)
     check_plot(plot)
-    check_every(every)
     true, found = read_scene(truth), read_scene_of(estimate)
     groundtruth = truth.parent / "groundtruth.txt"
     if align is None and is_database(estimate) and groundtruth.is_file():
@@ -177,7 +162,6 @@ def _identities(
 ) -> dict[str, Any] | None:
     """Id switches, None where there are no true ids of pixels or the estimate has no masks."""
     from list3r.evaluation.identity import evaluate_identities
-    from list3r.memory.core.errors import OptionError
 
     folder = ids or truth.parent / "ids"
     if ids is not None and not ids.is_dir():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from list3r.cli.common import open_memory
 from list3r.cli.terminal import note
 from list3r.exporters.output import is_database
+from list3r.memory.core.errors import FrameError, OptionError, SourceError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,7 +61,6 @@ def _stored(path: Path) -> Trajectory:
     import numpy as np
 
     from list3r.evaluation.trajectory import Trajectory
-    from list3r.memory.core.errors import OptionError
 
     with open_memory(path) as scene:
         parts: dict[tuple[int, int], list[Any]] = {}
@@ -87,7 +87,6 @@ def _given(path: Path) -> Trajectory:
 
     from list3r.evaluation.trajectory import Trajectory
     from list3r.frames.source import open_source
-    from list3r.memory.core.errors import OptionError
 
     poses = open_source(path).read_poses()
     if not poses:
@@ -118,14 +117,11 @@ class DepthFrames:
 
 def read_depth_frames(path: Path, every: int | None, width: int) -> DepthFrames:
     """Every n-th frame (None: about 250 in all) of a source with depth and poses, at most about `width` px wide."""
-    from dataclasses import replace
-
     import numpy as np
 
     from list3r.frames.base import Frame
     from list3r.frames.options import SourceOptions
     from list3r.frames.source import open_source, require_camera
-    from list3r.memory.core.errors import OptionError
 
     info = open_source(path, SourceOptions(every=every or 1)).info
     if not info.has_poses or not info.has_depth:
@@ -201,7 +197,6 @@ def _remembered(path: Path) -> tuple[PointCloud, Trajectory]:
 
     from list3r.evaluation.point_clouds import PointCloud
     from list3r.exporters.components import read_components
-    from list3r.memory.core.errors import OptionError
 
     with open_memory(path) as scene:
         main = read_components(scene.store)[0]
@@ -241,7 +236,6 @@ def mask_frames(store: Store, ids_folder: Path, every: int) -> Iterator[tuple[An
     import numpy as np
 
     from list3r.frames.decoding.decode import read_raw_depth
-    from list3r.memory.core.errors import FrameError, SourceError
     from list3r.memory.core.masks import decode_mask
 
     tracks = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -18,8 +18,9 @@ Estimate = Annotated[Path, typer.Argument(metavar="ESTIMATE", show_default=False
 PlotOption = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Also draw a picture: .png, .pdf or .svg.")
 ]
+Scale = Literal["auto", "free", "fixed"]
 ScaleOption = Annotated[
-    str,
+    Scale,
     typer.Option(
         "--scale",
         metavar="auto|free|fixed",
@@ -28,29 +29,13 @@ ScaleOption = Annotated[
 ]
 EveryOption = Annotated[
     int | None,
-    typer.Option("--every", metavar="N", help="Read every N-th frame of a source; default: about 250 in all."),
+    typer.Option("--every", min=1, metavar="N", help="Read every N-th frame of a source; default: about 250 in all."),
 ]
 
 
 def share(value: float | None) -> str:
     """A share in two decimals, a dash for none."""
     return "-" if value is None else f"{value:.2f}"
-
-
-def check_scale(scale: str) -> None:
-    """Raises `OptionError` for a scale that is none of the choices."""
-    from list3r.memory.core.errors import OptionError
-
-    if scale not in ("auto", "free", "fixed"):
-        raise OptionError(f"--scale {scale}: use auto, free or fixed")
-
-
-def check_every(every: int | None) -> None:
-    """Raises `OptionError` for an `--every` below 1."""
-    from list3r.memory.core.errors import OptionError
-
-    if every is not None and every < 1:
-        raise OptionError(f"--every {every}: must be at least 1")
 
 
 def check_plot(plot: Path | None) -> None:
@@ -73,6 +58,6 @@ def save_picture(figure: Figure, path: Path) -> None:
     note(f"note: {path} written")
 
 
-def free_scale(scale: str, estimate: Path) -> bool:
+def free_scale(scale: Scale, estimate: Path) -> bool:
     """Whether the scale of an alignment is free: as asked, or by `auto` for a memory of relative scale."""
     return scale == "free" or (scale == "auto" and scale_of(estimate) == "relative")

@@ -15,12 +15,12 @@ from list3r.cli.measure.options import (
     EveryOption,
     PlotOption,
     Truth,
-    check_every,
     check_plot,
     save_picture,
     share,
 )
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.evaluation.revisits import RevisitScores
@@ -58,10 +58,8 @@ def revisits(
     from list3r.evaluation.covisibility import write_covisibility
     from list3r.evaluation.revisits import Candidates, RevisitTruthSettings, judge, score
     from list3r.exporters.output import check_target, replacing
-    from list3r.memory.core.errors import OptionError
 
     settings = RevisitTruthSettings(least, different, precision)
-    check_every(every)
     check_plot(plot)
     if save is not None:
         if save.suffix.lower() != ".npz":
@@ -99,8 +97,6 @@ def revisits(
 def _check_clock(path: Path, frame: Any, time_s: Any, times: dict[int, float]) -> None:
     """Raises `OptionError` when the truth's frames are not the memory's."""
     import numpy as np
-
-    from list3r.memory.core.errors import OptionError
 
     gaps = [abs(times[int(k)] - float(t)) for k, t in zip(frame, time_s, strict=True) if int(k) in times]
     if not gaps:

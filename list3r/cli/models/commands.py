@@ -11,8 +11,9 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.build import source_options as src
 from list3r.cli.build.progress import watching
-from list3r.cli.common import JsonOption, LicenceOption, only, print_table, spread
+from list3r.cli.common import JsonOption, LicenceOption, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.request import BuildRequest, RunOptions
 
 if TYPE_CHECKING:
@@ -87,14 +88,13 @@ def fetch_model(
         print_answer(done)
 
 
-@spread
 def precompute(
     source: src.SourceArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")],
     *,
-    request: Annotated[BuildRequest, only("reconstruction", "device", "weights", "poses", "chunk", "overlap")],
+    request: Annotated[BuildRequest, "reconstruction", "device", "weights", "poses", "chunk", "overlap"],
     given: src.SourceArguments,
-    run: Annotated[RunOptions, only("licence")],
+    run: Annotated[RunOptions, "licence"],
     force: Annotated[bool, typer.Option("--force", help="Write finished chunks again.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -146,7 +146,6 @@ def model_facts(card: ModelCard, weights: Weights | None) -> dict[str, Any]:
 
 def _wanted(name: str, licence: str) -> list[Weights]:
     """The weights of a name. Raises `OptionError` for an unknown or forbidden name."""
-    from list3r.memory.core.errors import OptionError
     from list3r.models.cards import cards_named
     from list3r.models.licences import check_profile, choose_weights
 
@@ -161,7 +160,6 @@ def _wanted(name: str, licence: str) -> list[Weights]:
 
 def _named(name: str, licence: str) -> Weights:
     """Weights that are named by their repository. Raises `OptionError` for weights that the profile does not allow."""
-    from list3r.memory.core.errors import OptionError
     from list3r.models.cache import split_name
     from list3r.models.cards import CARDS, OTHER, UNPINNED, Weights, find_weights
     from list3r.models.licences import choose_weights

@@ -10,12 +10,12 @@ import typer
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
 from list3r.cli.build import source_options as src
-from list3r.cli.common import JsonOption, MemoryArgument, only, print_table, spread
+from list3r.cli.common import JsonOption, MemoryArgument, print_table
 from list3r.cli.terminal import say
+from list3r.memory.core.errors import OptionError
 from list3r.pipeline.request import RunOptions
 
 
-@spread
 def detect(
     memory: MemoryArgument,
     detector: Annotated[
@@ -25,7 +25,7 @@ def detect(
         ),
     ],
     *,
-    run: Annotated[RunOptions, only("detector_classes")],
+    run: Annotated[RunOptions, "detector_classes"],
     source: Annotated[
         str | None,
         typer.Option(
@@ -42,8 +42,6 @@ def detect(
 
     Example: list3r detect house.l3r --detector nanodet-m.param --source walk.mp4
     """
-    from list3r.memory.core.errors import OptionError
-
     if source is None and given != src.SourceArguments():
         raise OptionError("options of a video, such as --every, need the video: --source SOURCE")
     from list3r.pipeline.finishing import load_detector, name_things

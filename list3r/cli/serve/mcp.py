@@ -12,6 +12,7 @@ from list3r.cli import terminal
 from list3r.cli.answer import print_answer
 from list3r.cli.common import JsonOption, MemoryArgument
 from list3r.cli.terminal import note
+from list3r.memory.core.errors import OptionError
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -39,8 +40,6 @@ def mcp(
 
     Example: list3r mcp house.l3r --http
     """
-    from list3r.memory.core.errors import OptionError
-
     if (memory is None) == (catalog is None):
         raise OptionError("give either a memory or --catalog URL, such as: list3r mcp house.l3r")
     if catalog is not None and write:

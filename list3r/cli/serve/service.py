@@ -10,6 +10,7 @@ import typer
 
 from list3r.cli.catalog.commands import CatalogOption
 from list3r.cli.terminal import note, say
+from list3r.memory.core.errors import OptionError
 
 SECRET_VARIABLE = "LIST3R_SERVE_SECRET"
 _FIRST_TOKEN_HOURS = 24.0
@@ -33,7 +34,6 @@ def serve(
 
     Example: list3r serve --catalog postgresql://db.example/list3r --workers 4
     """
-    from list3r.memory.core.errors import OptionError
     from list3r.server.http.tokens import make_token
 
     secret = os.environ.get(SECRET_VARIABLE)

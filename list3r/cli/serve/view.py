@@ -15,7 +15,9 @@ def view(
     memories: Annotated[
         list[Path], typer.Argument(metavar="MEMORY...", help="The memory file; several are shown side by side.")
     ],
-    port: Annotated[int, typer.Option("--port", help="Port on this machine; the next free one if taken.")] = 8741,
+    port: Annotated[
+        int, typer.Option("--port", min=1, max=65535, help="Port here; the next free one if taken.")
+    ] = 8741,
     write: Annotated[bool, typer.Option("--write", help="Allow edits; no other program can write meanwhile.")] = False,
     browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
 ) -> None:
@@ -24,10 +26,6 @@ def view(
     Example: list3r view house.l3r
     """
     from list3r.api import open as open_scene
-    from list3r.memory.core.errors import OptionError
-
-    if not 0 < port <= 65535:
-        raise OptionError(f"--port {port} must be between 1 and 65535")
     from list3r.viewer.app import Viewer, ViewerSettings, serve
 
     with contextlib.ExitStack() as stack:

@@ -34,7 +34,7 @@ from list3r.instances.settings import FEATURE_SPACE
 from list3r.memory.core.geometry import Array, Sim3
 from list3r.memory.core.masks import encode_mask
 from list3r.memory.core.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
-from list3r.memory.library.overlap.visibility import DepthView, views_of
+from list3r.memory.library.overlap.visibility import DepthView, chunk_views
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.local_instances import LocalNode
 
@@ -60,8 +60,9 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         others = [c for c in near if c.component == chunk.component and _is(c, session_id) != _is(chunk, session_id)]
         if others and store.chunks.feature_space(chunk.chunk_id) == FEATURE_SPACE:
             unit = float(chunk.S_world_chunk.scale) if chunk.scale_kind != "metric" else 1.0
-            own = views_of([chunk], keyframes, unit)
-            asked.append((chunk, own, unit, ask(own, views_of(others, keyframes, unit), unit, s)))
+            own = chunk_views(chunk, keyframes[chunk.chunk_id], unit)
+            across = [view for c in others for view in chunk_views(c, keyframes[c.chunk_id], unit)]
+            asked.append((chunk, own, unit, ask(own, across, unit, s)))
     added = 0
     left = {chunk.chunk_id: gone(seen, s) for chunk, _, _, seen in asked}
     for chunk, own, unit, seen in asked:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 
 from list3r.instances.base import Proposals
 from list3r.instances.geometric.fusion import View, intrinsics_of
@@ -22,34 +23,20 @@ def join_candidates(views: ChunkViews, proposals: Sequence[Proposals]) -> list[N
     Candidates with a common identity are one; the others are joined best overlap first, and never two of one anchor.
     """
     offsets = np.cumsum([0] + [len(p.score) for p in proposals])
-    parent = np.arange(offsets[-1])
-    anchors: list[set[int]] = [{a} for a, p in enumerate(proposals) for _ in p.score]
+    sets = DisjointSet(range(int(offsets[-1])))
+    anchor = np.repeat(np.arange(len(proposals)), [len(p.score) for p in proposals])
     if all(p.identity is not None for p in proposals):
         known = np.concatenate([p.identity for p in proposals if p.identity is not None] or [np.zeros(0, np.int64)])
         first: dict[int, int] = {}
         for node, identity in enumerate(known.tolist()):
-            parent[node] = first.setdefault(identity, node)
+            sets.merge(first.setdefault(identity, node), node)
     else:
         for _, a, b in sorted(_overlaps(views, proposals, offsets), key=lambda e: (-e[0], e[1], e[2])):
-            _union(parent, anchors, a, b)
-    roots = np.array([_find(parent, node) for node in range(len(parent))], np.int64)
-    number = {root: k for k, root in enumerate(dict.fromkeys(roots.tolist()))}
-    joined = np.array([number[root] for root in roots.tolist()], np.int64)
+            if set(anchor[list(sets.subset(a))].tolist()).isdisjoint(anchor[list(sets.subset(b))].tolist()):
+                sets.merge(a, b)
+    number: dict[int, int] = {}
+    joined = np.array([number.setdefault(sets[n], len(number)) for n in range(int(offsets[-1]))], np.int64)
     return [joined[offsets[a] : offsets[a + 1]] for a in range(len(proposals))]
-
-
-def _find(parent: NDArray[np.int64], node: int) -> int:
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = int(parent[node])
-    return node
-
-
-def _union(parent: NDArray[np.int64], anchors: list[set[int]], a: int, b: int) -> None:
-    a, b = sorted((_find(parent, a), _find(parent, b)))
-    if a != b and not anchors[a] & anchors[b]:
-        parent[b] = a
-        anchors[a] |= anchors[b]
 
 
 def _overlaps(

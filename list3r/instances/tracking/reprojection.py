@@ -125,22 +125,24 @@ class LabelledChunk:
         return tracks
 
     def _library(self, tracks: Sequence[GrowingTrack], feature_space: str) -> LocalLibrary:
-        views, proposals, joined, supports = self.views, self.proposals, self.joined, self.supports
+        views = self.views
         size = (views.reconstruction.camera.height, views.reconstruction.camera.width)
         posed = int(views.reconstruction.posed.sum())
         least = self.settings.track.least_frames(posed)
         instances: list[LocalInstance] = []
-        for number, (track, support) in enumerate(zip(tracks, supports, strict=True)):
+        for number, (track, support) in enumerate(zip(tracks, self.supports, strict=True)):
             stability = float(np.mean(track.agreement)) if track.agreement else 0.0
             if len(track.frames) < least or stability < self.settings.track.min_stability or len(support.points) < 10:
                 continue
-            plane, structure = _surface(views, proposals, joined, number)
-            feature = _joined_feature(proposals, joined, number)
-            names = () if structure else _names(proposals, joined, number)
-            stability *= 1.0 if structure else _whole(proposals, joined, number)
-            instance = LocalInstance(len(instances), track.record(size), feature, support, stability, plane, structure)
-            named = () if structure else _named(proposals, joined, number)
-            instances.append(replace(instance, names=names, named=named))
+            found = zip(self.proposals, self.joined, strict=True)
+            seen = _SeenViews([(p, n) for p, owner in found for n in np.flatnonzero(owner == number).tolist()])
+            plane, structure = seen.surface(views)
+            stability *= 1.0 if structure else seen.whole()
+            record, own = track.record(size), seen.feature()
+            instance = LocalInstance(len(instances), record, own, support, stability, plane, structure)
+            if not structure:
+                instance = replace(instance, names=seen.names(), named=seen.named())
+            instances.append(instance)
         pairs = cannot_link_pairs(instances, self.settings.track.cannot_link_frames, views.unit)
         return LocalLibrary(tuple(instances), pairs, feature_space)
 
@@ -267,59 +269,40 @@ def _look_for(
     return seen_count / total, hit / np.maximum(seen_count, 1)
 
 
-def _surface(
-    views: ChunkViews, proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
-) -> tuple[NDArray[np.float64] | None, bool]:
-    """The plane of an instance in chunk coordinates, if its candidates have one, and whether it bounds the room."""
-    structure = False
-    for candidates, owner in zip(proposals, joined, strict=True):
-        for n in np.flatnonzero(owner == number):
-            structure |= bool(candidates.structure[n]) if candidates.structure is not None else False
-            if np.isfinite(candidates.plane[n]).all():
-                T_cam_chunk = np.linalg.inv(views.pose(candidates.position))
-                return np.asarray(candidates.plane[n] @ T_cam_chunk), structure
-    return None, structure
+@dataclass(frozen=True)
+class _SeenViews:
+    """The candidates, on all anchors, that one instance was found as."""
 
+    found: Sequence[tuple[Proposals, int]]
+    """Candidates of an anchor, and the number of the one that is meant."""
 
-def _names(
-    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
-) -> tuple[tuple[str, float], ...]:
-    """Return the names of an instance's candidates, with their scores, in order of the anchors."""
-    return tuple(
-        (p.names[n], float(p.score[n]))
-        for p, owner in zip(proposals, joined, strict=True)
-        if p.names is not None
-        for n in np.flatnonzero(owner == number).tolist()
-    )
+    def surface(self, views: ChunkViews) -> tuple[NDArray[np.float64] | None, bool]:
+        """Return the plane in chunk coordinates, if a candidate has one, and whether the instance bounds the room."""
+        structure = any(p.structure is not None and bool(p.structure[n]) for p, n in self.found)
+        for p, n in self.found:
+            if np.isfinite(p.plane[n]).all():
+                return np.asarray(p.plane[n] @ np.linalg.inv(views.pose(p.position))), structure
+        return None, structure
 
+    def whole(self) -> float:
+        """Return the mean probability that the candidates are one object; 1 where it is unknown."""
+        said = np.array([p.whole[n] for p, n in self.found if p.whole is not None], np.float32)
+        return float(said.mean()) if len(said) else 1.0
 
-def _whole(proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int) -> float:
-    """Return the mean probability that an instance's candidates are one object; 1 where it is unknown."""
-    said = [p.whole[owner == number] for p, owner in zip(proposals, joined, strict=True) if p.whole is not None]
-    every = np.concatenate(said) if said else np.zeros(0, np.float32)
-    return float(every.mean()) if len(every) else 1.0
+    def names(self) -> tuple[tuple[str, float], ...]:
+        """Return the names of the candidates, with their scores, in order of the anchors."""
+        return tuple((p.names[n], float(p.score[n])) for p, n in self.found if p.names is not None)
 
-
-def _named(
-    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
-) -> tuple[tuple[str, float], ...]:
-    """Return the names that an instance may have: the mean over its candidates on all anchors."""
-    said = [
-        p.named[n]
-        for p, owner in zip(proposals, joined, strict=True)
-        if p.named is not None
-        for n in np.flatnonzero(owner == number).tolist()
-    ]
-    total: dict[str, float] = {}
-    for names in said:
-        for name, probability in names:
+    def named(self) -> tuple[tuple[str, float], ...]:
+        """Return the names that the instance may have: the mean over its candidates."""
+        said = [p.named[n] for p, n in self.found if p.named is not None]
+        total: dict[str, float] = {}
+        for name, probability in (pair for names in said for pair in names):
             total[name] = total.get(name, 0.0) + probability / len(said)
-    return tuple(sorted(total.items(), key=lambda item: (-item[1], item[0])))
+        return tuple(sorted(total.items(), key=lambda item: (-item[1], item[0])))
 
-
-def _joined_feature(
-    proposals: Sequence[Proposals], joined: Sequence[NDArray[np.int64]], number: int
-) -> NDArray[np.float32]:
-    rows = [p.features[j == number] for p, j in zip(proposals, joined, strict=True)]
-    score = [p.score[j == number] for p, j in zip(proposals, joined, strict=True)]
-    return mean_feature(np.concatenate(rows), np.concatenate(score))
+    def feature(self) -> NDArray[np.float32]:
+        """Return the mean feature of the candidates."""
+        return mean_feature(
+            np.array([p.features[n] for p, n in self.found]), np.array([p.score[n] for p, n in self.found])
+        )

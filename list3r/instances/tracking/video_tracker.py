@@ -88,7 +88,7 @@ class VideoTracker:
         """Logits (h, w) of every followed object at working size, frame by frame in the given order."""
         import torch
 
-        state = _State(self._new_session(frames), self._network)
+        state = _Inference(self._new_session(frames), self._network)
         with torch.inference_mode():
             for position in order:
                 picture = network_input(frames[position].color, self._shape, self._device, self._network.dtype)
@@ -103,17 +103,17 @@ class VideoTracker:
 
     def _with_room(
         self,
-        state: _State,
+        state: _Inference,
         prompts: dict[int, NDArray[np.bool_]],
         found: Mapping[int, NDArray[np.float32]],
         tracked: _Objects,
         frames: Sequence[Frame],
-    ) -> tuple[_State, dict[int, NDArray[np.bool_]]]:
+    ) -> tuple[_Inference, dict[int, NDArray[np.bool_]]]:
         """Return the session that follows the prompts too, and the prompts: a new one where there would be too many."""
         if len(state.objects | prompts.keys()) <= self._tracker.most_live:
             return state, prompts
         live = {**{k: v > 0 for k, v in found.items() if (v > 0).any()}, **prompts}
-        return _State(self._new_session(frames), self._network), tracked.most_wanted(live)
+        return _Inference(self._new_session(frames), self._network), tracked.most_wanted(live)
 
     def _new_session(self, frames: Sequence[Frame]) -> Any:
         import transformers
@@ -146,7 +146,7 @@ def _even_scores(network: Any) -> None:
     network._run_single_frame_inference = even
 
 
-class _State:
+class _Inference:
     """One inference session of the network, kept small."""
 
     def __init__(self, session: Any, network: Any) -> None:
@@ -231,8 +231,6 @@ class _Objects:
         for candidate in range(len(self._proposals[number].score)):
             mask = labels == candidate + 1
             area = int(mask.sum())
-            if area == 0:
-                continue
             iou = {k: (mask & m).sum() / max(1, (mask | m).sum()) for k, m in followed.items()}
             best = max(iou, key=lambda k: (iou[k], -k), default=-1)
             if best >= 0 and iou[best] >= self._settings.same_iou:
@@ -240,10 +238,10 @@ class _Objects:
             elif (mask & covered).sum() < self._settings.covered * area:
                 self.joined[number][candidate] = self.count
                 new[self.count] = mask
-                self._prompted[position, self.count] = mask
-                if position != min(self._anchors):
-                    self.late[self.count] = position
                 self.count += 1
+        self._prompted.update({(position, k): mask for k, mask in new.items()})
+        if position != min(self._anchors):
+            self.late.update(dict.fromkeys(new, position))
         return new
 
     def most_wanted(self, live: dict[int, NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:

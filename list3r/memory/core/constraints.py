@@ -163,10 +163,10 @@ class Constraints:
             if edit.kind == "split":
                 for a, b in product(*edit.parts[:2]):
                     links.cannot_link(a, b)
-            elif edit.kind == "label":
+            if edit.kind == "label":
                 labels.append((frozenset(keys), edit.text))
                 touched.update(keys)
-            elif edit.kind == "delete":
+            if edit.kind == "delete":
                 _must_link(links, [keys])
                 deletions.append(Deletion(frozenset(keys), edit.through))
         return Constraints(links, tuple(deletions), tuple(labels), frozenset(touched))

@@ -343,7 +343,7 @@ class BestView:
 
 
 FIRST_SCRAP = 1_000_000_000
-"""From this on ids are those of scraps, see `maintenance.scraps`."""
+"""From this on ids are those of scraps, see `maintenance.unlisted`."""
 FIRST_UNLISTED = 1_500_000_000
 """From this on ids are those of groups that are not listed, see `maintenance.unlisted`."""
 

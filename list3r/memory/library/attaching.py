@@ -9,16 +9,13 @@ import numpy as np
 
 from list3r.memory.core.records import Instance, Observation
 from list3r.memory.library.evidence import Evidence, weigh
-from list3r.memory.library.grouping import Group
-from list3r.memory.library.instances import Members, derived_instance
 from list3r.memory.library.merging.edges import NONE, links_of
 from list3r.memory.library.merging.nodes import Nodes
 from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
-from list3r.memory.library.relations.structure import flagged_only
-from list3r.memory.library.rows import record_of
+from list3r.memory.library.rows import record_alone
 from list3r.memory.library.rules import ConsolidationReport
 from list3r.memory.library.scene import Scene
-from list3r.memory.library.uncertainty import position_sigma
+from list3r.memory.library.uncertainty import position_sigmas
 
 _COMPARED = 12
 """Chunks with which a new one is compared: those that saw most of the instances that lie where it looked."""
@@ -107,17 +104,13 @@ def _seen_again(scene: Scene, chunk_id: int, seen: Mapping[Key, int]) -> Iterabl
 def _add(scene: Scene, fresh: Mapping[int, tuple[Key, Evidence]]) -> None:
     """Write instances of one local instance each."""
     store, world, records, features = scene.store, scene.world, list[Instance](), list[np.ndarray]()
-    metric = store.facts.scale_kind != "relative"
     for n, (key, evidence) in fresh.items():
-        row, shapes, group = scene.rows[key[0]], scene.shapes(key[0]), Group((key,))
-        of = {key[0]: (shapes, row.S_world_chunk, np.zeros(len(shapes.points), bool))}
-        upright = world.upright and row.component == world.first
-        found = derived_instance(n, Members(group, group, of, row.component, upright), scene.settings.derive)
-        kind, sure = flagged_only([found.geometry])[0], round(evidence.confidence, 4)
-        found = replace(found, geometry=replace(found.geometry, structure=kind, confidence=sure))
-        record = record_of(found, None, scene.times_of([key[0]]), world, metric=metric)
-        records.append(replace(record, position_sigma_m=position_sigma(record.center, [row])))
-        features.append(found.feature)
+        k = key[0]
+        record, feature = record_alone(scene, n, (key,), {k: scene.shapes(k)}, evidence.confidence, bounds=True)
+        at = np.zeros(1, np.int64)
+        (sigma,) = position_sigmas(record.center[None], at, at, [scene.rows[k]])
+        records.append(replace(record, position_sigma_m=sigma))
+        features.append(feature)
     store.instances.put(records)
     if world.space and records and store.chunks.feature_space(next(iter(fresh.values()))[0][0]) == world.space:
         store.embeddings.put(world.space, list(fresh), np.array(features, np.float32))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from list3r.memory.core.records import Instance, MergeDecision, Relation
 from list3r.memory.library.evidence import Evidence, contested, weigh, without_missed
 from list3r.memory.library.grouping import Group, Groups, chunks_of, group
 from list3r.memory.library.identities import Identities, assign_ids
-from list3r.memory.library.instances import DerivedInstance, Members, derived_instance
+from list3r.memory.library.instances import DerivedInstance, derived_instance
 from list3r.memory.library.overlap.pair_scores import Key, PairScores
 from list3r.memory.library.redundancy import Redundant, find_redundant
 from list3r.memory.library.relating import relate, with_structure
@@ -162,7 +163,7 @@ def _labels(scene: Scene, members: Mapping[int, Group], known: Known) -> dict[in
 
 def _instances(scene: Scene, members: Mapping[int, Group], formed: Formed) -> dict[int, DerivedInstance]:
     """Return the instances of groups, by id, without the points that belong to something else."""
-    world, groups = scene.world, list(formed.weighed)
+    world, groups, settings = scene.world, list(formed.weighed), scene.settings.derive
     chunks = {k: scene.shapes(k) for k in chunks_of(groups)}
     poses = {k: scene.pose(k) for k in chunks}
     dropped = contested(groups, chunks, poses, world.unit, scene.settings.evidence)
@@ -173,7 +174,12 @@ def _instances(scene: Scene, members: Mapping[int, Group], formed: Formed) -> di
         here = g if mover is not None else formed.changes.current.get(g[0], g)
         component = scene.component(g[0][0])
         upright = world.upright and component == world.first
-        found = derived_instance(n, Members(g, here, of, component, upright, mover), scene.settings.derive)
+        derived = partial(derived_instance, n, chunks=of, component=component, upright=upright, settings=settings)
+        found = derived(here)
+        if mover is not None:
+            now = derived([key for key in g if key in mover.last])
+            found = replace(found, geometry=now.geometry, box=now.box, shape=now.shape)
+            found = replace(found, dynamic=True, resting=mover.resting)
         out[n] = replace(found, geometry=replace(found.geometry, confidence=round(formed.weighed[g].confidence, 4)))
     return out
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from list3r.memory.core.description.colors import Swatch, dominant_colors
 from list3r.memory.core.description.describe import shape_word
 from list3r.memory.core.geometry import Array, OrientedBox, Sim3
 from list3r.memory.core.records import BestView
-from list3r.memory.library.merging.movers import Mover
 from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry, fit_box, without_strays
@@ -61,15 +60,9 @@ class Member:
     dropped: NDArray[np.bool_]
     """Points of the chunk's shapes that belong to something else. Shape (R,)."""
 
-    @property
-    def span(self) -> tuple[int, int]:
-        """First and end of its points in the chunk's shapes, which are ordered by owner."""
-        start, stop = np.searchsorted(self.shapes.owner, [self.at, self.at + 1])
-        return int(start), int(stop)
-
     def own(self) -> NDArray[np.int64]:
         """Return positions of the points of the chunk's shapes that are its surface. Shape (M,)."""
-        start, stop = self.span
+        start, stop = np.searchsorted(self.shapes.owner, [self.at, self.at + 1])
         return np.asarray(start + np.flatnonzero(~self.dropped[start:stop]))
 
 
@@ -95,54 +88,19 @@ class DerivedInstance:
     """Whether it stands still there, so that it has relations."""
 
 
-@dataclass(frozen=True)
-class Members:
-    """The local instances of one instance."""
-
-    group: Sequence[Key]
-    shown_by: Sequence[Key]
-    """Those that show it where it is now."""
-    chunks: Mapping[int, tuple[ChunkShapes, Sim3, NDArray[np.bool_]]]
-    """Shapes, pose in the world and dropped points of each chunk."""
-    component: int
-    upright: bool
-    """Whether z is up there."""
-    mover: Mover | None = None
-    """What is known of its motion."""
-
-    def of(self, keys: Sequence[Key]) -> list[Member]:
-        """Return some of them."""
-        found = ((self.chunks[k], n) for k, n in keys)
-        return [Member(c[0], int(np.searchsorted(c[0].local_id, n)), c[1], c[2]) for c, n in found]
-
-
-def derived_instance(instance_id: int, members: Members, settings: DeriveSettings) -> DerivedInstance:
-    """Return an instance of its members, where it is now."""
-    m = members
-    found = derive_instance(instance_id, m.of(m.shown_by), m.component, upright=m.upright, settings=settings)
-    if m.mover is None:
-        return found
-    last = m.of([k for k in m.group if k in m.mover.last])
-    now = derive_instance(instance_id, last, m.component, upright=m.upright, settings=settings)
-    return replace(
-        found,
-        geometry=now.geometry,
-        box=now.box,
-        shape=now.shape,
-        dynamic=True,
-        resting=m.mover.resting,
-    )
-
-
-def derive_instance(
+def derived_instance(
     instance_id: int,
-    members: Sequence[Member],
+    keys: Sequence[Key],
+    chunks: Mapping[int, tuple[ChunkShapes, Sim3, NDArray[np.bool_]]],
     component: int,
     *,
     upright: bool,
     settings: DeriveSettings,
 ) -> DerivedInstance:
-    """Return all that follows from the members of one instance; `upright` says that z is up."""
+    """Return all that follows from the local instances of one instance; `chunks` are shapes, pose in the world and
+    dropped points of theirs, `upright` says that z is up.
+    """
+    members = [Member(chunks[k][0], int(np.searchsorted(chunks[k][0].local_id, n)), *chunks[k][1:]) for k, n in keys]
     s = settings
     own = [m.own() for m in members]
     points = np.concatenate([m.S_world_chunk.apply(m.shapes.points[k]) for m, k in zip(members, own, strict=True)])

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from list3r.memory.core.description.colors import color_names, color_words, main_color
 from list3r.memory.core.description.describe import describe
 from list3r.memory.core.geometry import Array
 from list3r.memory.core.records import Instance
-from list3r.memory.library.instances import DerivedInstance
+from list3r.memory.library.instances import DerivedInstance, derived_instance
+from list3r.memory.library.overlap.pair_scores import Key
+from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry
+from list3r.memory.library.relations.structure import flagged_only
 from list3r.memory.library.rules import World
+from list3r.memory.library.scene import Scene
 
 
 def record_of(
@@ -49,6 +57,29 @@ def record_of(
         best_view=found.best_view,
         dynamic=found.dynamic,
     )
+
+
+def record_alone(
+    scene: Scene,
+    instance_id: int,
+    group: Sequence[Key],
+    shapes: Mapping[int, ChunkShapes],
+    confidence: float,
+    *,
+    bounds: bool = False,
+) -> tuple[Instance, NDArray[np.float32]]:
+    """Return the record of an instance whose surface nothing else claims, and its feature; with `bounds` it may be
+    structure. `shapes` are those of its chunks.
+    """
+    store, world, component = scene.store, scene.world, scene.component(group[0][0])
+    of = {k: (shapes[k], scene.pose(k), np.zeros(len(shapes[k].points), bool)) for k, _ in group}
+    upright = world.upright and component == world.first
+    settings = scene.settings.derive
+    found = derived_instance(instance_id, group, of, component, upright=upright, settings=settings)
+    kind = flagged_only([found.geometry])[0] if bounds else None
+    found = replace(found, geometry=replace(found.geometry, structure=kind, confidence=round(confidence, 4)))
+    metric = store.facts.scale_kind != "relative"
+    return record_of(found, None, scene.times_of({k for k, _ in group}), world, metric=metric), found.feature
 
 
 def _description(

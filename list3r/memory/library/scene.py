@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -31,8 +31,8 @@ class Scene:
         """All chunks by id."""
         self.scores = PairScoreCache(store, summaries, (settings.rounding, settings.changes, settings.shapes))
         self.constraints = store.edits.constraints()
-        self._times: dict[int, dict[tuple[int, int], float]] = {}
-        self._cameras: dict[int, Array] = {}
+        self._times = cache(lambda k: store.frames.times(self.rows[k]))
+        self._cameras = cache(lambda k: cameras_of(store, [self.rows[k]]).translation)
 
     # ------------------------------------------------------------------ one chunk
 
@@ -66,19 +66,12 @@ class Scene:
         """Return seconds by (session id, Frame.index) of the frames in the spans of chunks."""
         out: dict[tuple[int, int], float] = {}
         for k in chunk_ids:
-            if k not in self._times:
-                self._times[k] = self.store.frames.times(self.rows[k])
-            out |= self._times[k]
+            out |= self._times(k)
         return out
 
     def cameras_of(self, chunk_ids: Iterable[int]) -> Array:
         """Return where the cameras of chunks were, world. Shape (F, 3)."""
-        found = [np.zeros((0, 3))]
-        for k in chunk_ids:
-            if k not in self._cameras:
-                self._cameras[k] = cameras_of(self.store, [self.rows[k]]).translation
-            found.append(self._cameras[k])
-        return np.concatenate(found)
+        return np.concatenate([np.zeros((0, 3)), *map(self._cameras, chunk_ids)])
 
     # ------------------------------------------------------------------ pairs of chunks
 

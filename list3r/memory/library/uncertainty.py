@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.core.geometry import Array, Sim3, skew
+from list3r.memory.core.geometry import Array, Sim3, skew, stack, take
 from list3r.memory.core.records import ChunkRow
 from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.voxels import ChunkShapes
@@ -93,54 +93,35 @@ OF_COMPUTED_DEPTH = ConfidenceWeights(stability=9.56, frames=2.46, area=0.53, si
 frames is more often a bit that was computed wrongly, and what another chunk missed tells less."""
 
 
-def position_covariance(chunk: ChunkRow, center_world: Array) -> Array | None:
-    """Return the covariance of a point that is fixed to a chunk, world units, from the chunk's own. Shape (3,) -> (3,
-    3).
+def point_covariances(S_world_chunk: Sim3, covariance: Array, points_world: Array) -> Array:
+    """Return covariances of points that are fixed to chunks, from those of the chunks. Shapes of N: (N, 7, 7), (N, 3)
+    -> (N, 3, 3).
 
     S_true = S_world_chunk exp(x), x = (rho, omega, sigma), moves the point p of the chunk by rho + omega x p + sigma p
-    (first order). None where the chunk's covariance is not known.
+    (first order).
     """
-    if chunk.covariance is None:
-        return None
-    S = chunk.S_world_chunk
-    p = S.inverse().apply(center_world[None])[0]
-    moves = np.concatenate([np.eye(3), -skew(p), p[:, None]], axis=1)
-    moves = float(S.scale) * S.rotation @ moves
-    return np.asarray(moves @ chunk.covariance @ moves.T)
-
-
-def position_sigma(center_world: Array, chunks: Iterable[ChunkRow]) -> float | None:
-    """Return the standard deviation of an instance's position along the worst axis, world units; None where no chunk
-    knows its own.
-
-    `chunks` are those that saw it. An instance is derived from what all of them saw, and its error is a weighted mean
-    of theirs, which are correlated to an unknown degree: whatever the weights, it is no larger than that of the worst
-    placed chunk, and that is what is given. Relative to the first chunk of the component, as the chunks' covariances.
-    """
-    known = [C for chunk in chunks if (C := position_covariance(chunk, center_world)) is not None]
-    if not known:
-        return None
-    return float(max(np.sqrt(max(float(np.linalg.eigvalsh((C + C.T) / 2.0)[-1]), 0.0)) for C in known))
+    p = S_world_chunk.inverse().apply(points_world[:, None])[:, 0]
+    moves = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -skew(p), p[..., None]], axis=2)
+    moves = S_world_chunk.scale[:, None, None] * (S_world_chunk.rotation @ moves)
+    return np.asarray(moves @ covariance @ np.swapaxes(moves, 1, 2))
 
 
 def position_sigmas(
     centers_world: Array, owner: NDArray[np.int64], seen_in: NDArray[np.int64], chunks: Sequence[ChunkRow]
 ) -> list[float | None]:
-    """Return `position_sigma` of N instances at centres (N, 3); `owner`, (O,), are seen in the chunks `seen_in`."""
+    """Return the standard deviations of the positions of N instances along their worst axes, world units; None for one
+    of which no chunk knows its own. The instances `owner`, (O,), at centres (N, 3), are seen in the chunks `seen_in`.
+
+    An instance is derived from what all of its chunks saw, and its error is a weighted mean of theirs, which are
+    correlated to an unknown degree: whatever the weights, it is no larger than that of the worst placed chunk, and that
+    is what is given. Relative to the first chunk of the component, as the chunks' covariances.
+    """
     known = np.array([c.covariance is not None for c in chunks], bool)
     owner, seen_in = owner[known[seen_in]], seen_in[known[seen_in]]
-    out: list[float | None] = [None] * len(centers_world)
     if not len(owner):
-        return out
-    unknown = np.zeros((7, 7))
-    covariance = np.array([unknown if c.covariance is None else c.covariance for c in chunks])[seen_in]
-    scale = np.array([float(c.S_world_chunk.scale) for c in chunks])[seen_in]
-    rotation = np.array([c.S_world_chunk.rotation for c in chunks])[seen_in]
-    origin = np.array([c.S_world_chunk.translation for c in chunks])[seen_in]
-    p = Sim3(scale, rotation, origin).inverse().apply(centers_world[owner][:, None])[:, 0]
-    moves = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -skew(p), p[..., None]], axis=2)
-    moves = scale[:, None, None] * (rotation @ moves)
-    found = moves @ covariance @ np.swapaxes(moves, 1, 2)
+        return [None] * len(centers_world)
+    covariance = np.array([np.zeros((7, 7)) if c.covariance is None else c.covariance for c in chunks])[seen_in]
+    found = point_covariances(take(stack([c.S_world_chunk for c in chunks]), seen_in), covariance, centers_world[owner])
     most = np.linalg.eigvalsh((found + np.swapaxes(found, 1, 2)) / 2.0)[:, -1]
     worst = np.full(len(centers_world), -1.0)
     np.maximum.at(worst, owner, np.sqrt(np.maximum(most, 0.0)))

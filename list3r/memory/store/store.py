@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -43,135 +42,31 @@ class Store:
         self.connection = connection
         self.derived = Derived()
         """What is made of the memory and kept until it is closed."""
-
-    @cached_property
-    def facts(self) -> Facts:
-        """What is known of the memory as a whole."""
-        return Facts(self.connection)
-
-    # ------------------------------------------------------------------ what chunks measured, and where they lie
-
-    @cached_property
-    def sessions(self) -> Sessions:
-        """The videos."""
-        return Sessions(self.connection)
-
-    @cached_property
-    def frames(self) -> Frames:
-        """The frames of the trajectory."""
-        return Frames(self.connection)
-
-    @cached_property
-    def keyframes(self) -> Keyframes:
-        """Frames by which places are found again."""
-        return Keyframes(self.connection)
-
-    @cached_property
-    def supports(self) -> Supports:
-        """Surfaces of local instances."""
-        return Supports(self.connection)
-
-    @cached_property
-    def local_instances(self) -> LocalInstances:
-        """What one chunk measured of one thing."""
-        return LocalInstances(self.connection, self.supports)
-
-    @cached_property
-    def chunks(self) -> Chunks:
-        """Chunks, and where each lies."""
-        return Chunks(self.connection, self.frames, self.keyframes, self.local_instances)
-
-    @cached_property
-    def edges(self) -> Edges:
-        """Relations of chunks."""
-        return Edges(self.connection)
-
-    @cached_property
-    def bends(self) -> Bends:
-        """How chunks bend."""
-        return Bends(self.connection)
-
-    @cached_property
-    def votes(self) -> LabelVotes:
-        """Votes for labels."""
-        return LabelVotes(self.connection)
-
-    @cached_property
-    def trajectory(self) -> PlacedTrajectory:
-        """Where the cameras were."""
-        return PlacedTrajectory(self.chunks, self.frames, self.bends)
-
-    # ------------------------------------------------------------------ what is derived, and what operators said of it
-
-    @cached_property
-    def pair_scores(self) -> PairScoreTable:
-        """How pairs of chunks overlap."""
-        return PairScoreTable(self.connection)
-
-    @cached_property
-    def merges(self) -> MergeLog:
-        """Decisions of merging."""
-        return MergeLog(self.connection)
-
-    @cached_property
-    def edits(self) -> Edits:
-        """What operators changed."""
-        return Edits(self.connection)
-
-    @cached_property
-    def ids(self) -> Ids:
-        """What ids stand for today."""
-        return Ids(self.connection, self.facts)
-
-    @cached_property
-    def embeddings(self) -> Embeddings:
-        """Vectors of instances."""
-        return Embeddings(self.connection)
-
-    @cached_property
-    def relations(self) -> RelationTable:
-        """Relations of instances."""
-        return RelationTable(self.connection, self.ids)
-
-    @cached_property
-    def events(self) -> Events:
-        """What changed between sessions."""
-        return Events(self.connection)
-
-    @cached_property
-    def rooms(self) -> RoomTable:
-        """Rooms and the doorways between them."""
-        return RoomTable(self.connection)
-
-    @cached_property
-    def detected_labels(self) -> DetectedLabels:
-        """Labels of detectors."""
-        return DetectedLabels(self.connection)
-
-    @cached_property
-    def words(self) -> Words:
-        """Words that name instances."""
-        return Words(self.connection)
-
-    @cached_property
-    def instances(self) -> Instances:
-        """The instances of the library."""
-        return Instances(self.connection, self.ids, self.words)
-
-    @cached_property
-    def observations(self) -> Observations:
-        """Which local instances an instance is."""
-        return Observations(self.connection, self.ids)
-
-    @cached_property
-    def surfaces(self) -> Surfaces:
-        """Surfaces of instances in the world."""
-        return Surfaces(self.chunks, self.supports, self.instances, self.events)
-
-    @cached_property
-    def tracks(self) -> PlacedTracks:
-        """Where moving instances were."""
-        return PlacedTracks(
+        self.facts = Facts(connection)
+        self.sessions = Sessions(connection)
+        self.frames = Frames(connection)
+        self.keyframes = Keyframes(connection)
+        self.supports = Supports(connection)
+        self.local_instances = LocalInstances(connection, self.supports)
+        self.chunks = Chunks(connection, self.frames, self.keyframes, self.local_instances)
+        self.edges = Edges(connection)
+        self.bends = Bends(connection)
+        self.votes = LabelVotes(connection)
+        self.trajectory = PlacedTrajectory(self.chunks, self.frames, self.bends)
+        self.pair_scores = PairScoreTable(connection)
+        self.merges = MergeLog(connection)
+        self.edits = Edits(connection)
+        self.ids = Ids(connection, self.facts)
+        self.embeddings = Embeddings(connection)
+        self.relations = RelationTable(connection, self.ids)
+        self.events = Events(connection)
+        self.rooms = RoomTable(connection)
+        self.detected_labels = DetectedLabels(connection)
+        self.words = Words(connection)
+        self.instances = Instances(connection, self.ids, self.words)
+        self.observations = Observations(connection, self.ids)
+        self.surfaces = Surfaces(self.chunks, self.supports, self.instances, self.events)
+        self.tracks = PlacedTracks(
             (self.chunks, self.frames), (self.local_instances, self.supports), (self.instances, self.observations)
         )
 

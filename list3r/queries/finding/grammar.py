@@ -295,20 +295,27 @@ class _Reader:
         out: list[Clause] = []
         while self._next() and not (self._next() in ("and", "or") and self._next(1) not in ("relation", "not", "")):
             token = self._take()
+            if token.kind in ("and", "or"):
+                continue
             if token.kind == "not":
                 out += self._negation(head)
             elif token.kind == "relation":
                 either = self._at > 1 and self._tokens[self._at - 2].kind == "or" and bool(out)
                 out += [replace(c, either=either) for c in self._relation(token, head)]
-                while token.value in _SEVERAL and self._next() == "and" and not self._joins():
-                    self._take()
-                    out += self._relation(token, head)
-            elif token.kind not in ("and", "or"):
+                out += self._more_of(token, head)
+            else:
                 self._at -= 1
                 more = self._phrase()  # a word that stands after a clause: the lamp on the desk there
-                if self._at < len(self._tokens) and more.generic and more.order is None:
-                    self._at += 1
+                self._at += self._at < len(self._tokens) and more.generic and more.order is None
         return tuple(out)
+
+    def _more_of(self, token: Token, head: Phrase) -> list[Clause]:
+        """Return clauses of further things that "and" gives to the same relation."""
+        out: list[Clause] = []
+        while token.value in _SEVERAL and self._next() == "and" and not self._joins():
+            self._take()
+            out += self._relation(token, head)
+        return out
 
     def _joins(self) -> bool:
         """Whether what follows an "and" stands for itself: it has a relation of its own."""

@@ -55,13 +55,6 @@ def phrases() -> dict[tuple[str, ...], Token]:
 
 
 @cache
-def relation_words() -> dict[str, tuple[str, ...]]:
-    """Return what people say of how things stand to each other, and the predicates that it may mean."""
-    said = table()["relations"].items()
-    return {phrase: tuple(table()["predicates"][key]) for key, many in said for phrase in many.split("|")}
-
-
-@cache
 def openings(name: str) -> frozenset[tuple[str, ...]]:
     """Return phrases of the table as words."""
     said: Iterable[str] = table()[name].split("|") if isinstance(table()[name], str) else table()[name]
@@ -105,18 +98,22 @@ def tokens_of(words: list[str]) -> list[Token]:
     k = 0
     while k < len(words):
         length, token = _token_at(words, k)
+        has = words[k] in ("have", "has") and token.kind == "filler" and k + 1 < len(words)
+        if has and any(t.kind == "noun" for t in out):
+            token = Token("relation", words[k], "with")
         if token.kind != "filler":
             out.append(token)
-        elif words[k] in ("have", "has") and k + 1 < len(words) and any(t.kind == "noun" for t in out):
-            out.append(Token("relation", words[k], "with"))
-        elif words[k] in articles and out and out[-1].kind in ("noun", "word"):
-            last_words = k + 1 < len(words) and _token_at(words, k + 1)[1].kind in ("order", "rank")
-            since = 0 if last_words else next((n for n in range(len(out), 0, -1) if out[n - 1].kind == "noun"), 0)
-            if since and all(t.kind == "word" for t in out[since:]):
-                # Another thing begins, and how it stands to the first was not understood: the chair facing the desk.
-                out[since:] = [Token("relation", " ".join(t.text for t in out[since:]) or "near", "near")]
+        elif words[k] in articles and not (k + 1 < len(words) and _token_at(words, k + 1)[1].kind in ("order", "rank")):
+            _begin_another(out)
         k += length
     return out
+
+
+def _begin_another(out: list[Token]) -> None:
+    """Words after a noun, before an article, are a relation that was not understood: the chair facing the desk."""
+    since = next((n for n in range(len(out), 0, -1) if out[n - 1].kind == "noun"), 0)
+    if since and all(t.kind == "word" for t in out[since:]):
+        out[since:] = [Token("relation", " ".join(t.text for t in out[since:]) or "near", "near")]
 
 
 def _token_at(words: list[str], k: int) -> tuple[int, Token]:

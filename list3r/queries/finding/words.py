@@ -26,7 +26,7 @@ def wanted_words(text: str) -> list[str]:
 
 def is_named(instance: Instance, text: str) -> bool:
     """Tell whether label, kind of structure and description together have all the words, or others for the same."""
-    own = words_of(instance)
+    own = vocabulary(instance.label, instance.structure, instance.description, instance.color_name)
     return all(w in own or same_kind(w) in own for w in wanted_words(text))
 
 
@@ -39,27 +39,6 @@ def same_kind(word: str) -> str:
 def is_colored(instance: Instance, text: str) -> bool:
     """Tell whether the main colour has all the words: "red" is said of what is dark red, not the other way round."""
     return set(wanted_words(text)) <= set(split_words(instance.color_name))
-
-
-def words_of(instance: Instance) -> set[str]:
-    """Return all words that may name an instance: of its label, its kind of structure, its description and its
-    colour."""
-    return set(vocabulary(instance.label, instance.structure, instance.description, instance.color_name))
-
-
-def word_score(instance: Instance, wanted: list[str]) -> tuple[float, list[str]]:
-    """Return (score in [0, 1], words found): how well each word names it as `vocabulary` has it, the beginning of a
-    word half as well.
-    """
-    weights = vocabulary(instance.label, instance.structure, instance.description, instance.color_name)
-    total, hit = 0.0, []
-    for word in wanted:
-        begun = (0.5 * value for known, value in weights.items() if len(word) >= 3 and known.startswith(word))
-        best = weights.get(word) or max(begun, default=0.0)
-        if best > 0.0:
-            hit.append(word)
-        total += best
-    return total / len(wanted), hit
 
 
 def no_such_words(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:

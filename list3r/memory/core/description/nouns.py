@@ -133,27 +133,9 @@ def narrower(name: str) -> tuple[str, ...]:
     return tuple(n for n in all_nouns() if name in kinds_of(n))
 
 
-def branch_of(name: str) -> str | None:
-    """Return what a name is a kind of: "seat" of chair; None for what is unknown or stands highest."""
-    found = nouns_of(name)
-    return next(iter(kinds_of(found[0])), None) if found else None
-
-
 def is_a(name: str, broader: str) -> bool:
     """Tell whether a name is another, or a kind of it: a chair is a seat, and furniture."""
     if name in all_nouns() and broader in all_nouns():
         return name == broader or broader in kinds_of(name)
     one, other = nouns_of(name), nouns_of(broader)
     return bool(one and other) and other[0] in (*one, *kinds_of(one[0]))
-
-
-def usual_size_cm(name: str) -> tuple[float, float] | None:
-    """Return the least and the largest usual longest edge of what has a name, centimetres; None where unknown."""
-    return next((size for n in nouns_of(name) if (size := all_nouns()[n].size_cm)), None)
-
-
-def uses(name: str) -> tuple[str, ...]:
-    """Return what one does with what has a name, its own uses before those of what it is a kind of: "sit on"."""
-    found = nouns_of(name)
-    kinds = (found[0], *kinds_of(found[0])) if found else ()
-    return tuple(dict.fromkeys(u for k in kinds for u in all_nouns()[k].uses))

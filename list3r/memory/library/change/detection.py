@@ -23,7 +23,7 @@ from list3r.memory.library.change.matching import ChangeMatching
 from list3r.memory.library.change.places import Places
 from list3r.memory.library.change.records import Change, Changes, ChangeSettings, OverlapGroups
 from list3r.memory.library.change.surface_colors import other_surfaces
-from list3r.memory.library.merging.edges import PairScores
+from list3r.memory.library.overlap.pair_scores import PairScores
 from list3r.memory.library.overlap.summaries import ChunkSummary
 from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.store.store import Store

@@ -7,12 +7,13 @@ light.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from list3r.memory.core.geometry import Array, Sim3
-from list3r.memory.library.merging.edges import PairScores
+from list3r.memory.library.overlap.pair_scores import PairScores
 from list3r.memory.library.overlap.visibility import DepthView, VisibilitySettings, chunk_views, seen_through_shares
 from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.store.store import Store
@@ -26,7 +27,7 @@ class FreeSpaceCarving:
 
     def __init__(self, store: Store, settings: VisibilitySettings, least_overlap: float = 0.2) -> None:
         self._store, self._s, self._least = store, settings, least_overlap
-        self._views: OrderedDict[int, list[DepthView]] = OrderedDict()
+        self._views_of = lru_cache(_KEPT)(self._read_views)
 
     def shares(self, u: ChunkShapes, v: ChunkShapes, p: PairScores, S_v_u: Sim3) -> tuple[Array, Array]:
         """For each pair of instances of two chunks the share of either that the other chunk sees through.
@@ -43,17 +44,12 @@ class FreeSpaceCarving:
         if some:
             spans = np.searchsorted(own.owner, np.add.outer(some, (0, 1)))
             surfaces = [S_other_own.apply(own.points[start:stop]) for start, stop in spans.tolist()]
-            shares = seen_through_shares(surfaces, self._views_of(other), self._s)
+            shares = seen_through_shares(surfaces, self._views_of(other.chunk_id, other.unit), self._s)
             for n, share in zip(some, shares, strict=True):
                 out[meet & (at == n)] = share or 0.0
         return out
 
-    def _views_of(self, shapes: ChunkShapes) -> list[DepthView]:
-        """Return the keyframes of a chunk, in its own coordinates."""
-        k = shapes.chunk_id
-        if k not in self._views:
-            self._views[k] = chunk_views(shapes.session_id, self._store.keyframes.of(k), shapes.unit)
-        self._views.move_to_end(k)
-        while len(self._views) > _KEPT:
-            self._views.popitem(last=False)
-        return self._views[k]
+    def _read_views(self, chunk_id: int, unit: float) -> list[DepthView]:
+        """Return the keyframes of a chunk, in its own coordinates; `unit` is a metre there."""
+        chunk = replace(self._store.chunks.get(chunk_id), S_world_chunk=Sim3.identity())
+        return chunk_views(chunk, self._store.keyframes.of(chunk_id), unit)

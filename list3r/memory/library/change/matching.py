@@ -14,7 +14,7 @@ from list3r.memory.library.change.moves import Missing, Move, MoveSearch, Placed
 from list3r.memory.library.change.places import Places
 from list3r.memory.library.change.records import Change, Changes, ChangeSettings, OverlapGroups
 from list3r.memory.library.change.surface_colors import palette_distance
-from list3r.memory.library.merging.edges import Key
+from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.visibility import PlaceVisibility
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from list3r.memory.library.change.surface_colors import (
     meeting,
     small_picture,
 )
-from list3r.memory.library.merging.edges import Key
+from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.summaries import ChunkSummary, world_unit
 from list3r.memory.library.overlap.visibility import (
     DepthView,
@@ -31,13 +31,12 @@ from list3r.memory.library.overlap.visibility import (
     OtherSurface,
     PlaceVisibility,
     changed_points,
+    chunk_views,
     in_sight_of,
     place_visibility,
-    seen_through_share,
+    seen_through_shares,
     tally,
-    views_of,
 )
-from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.library.relations.instance_geometry import fit_box
 from list3r.memory.library.world.session_ties import SessionTies
 from list3r.memory.store.store import Store
@@ -58,16 +57,6 @@ class GroupLooks:
     """Colours of its surface, CIE L*a*b*, lightness at half weight, in the light of the later session. Shape (N, 3)."""
 
 
-class _Shapes(dict[int, ChunkShapes]):
-    """By chunk, read when they are first asked for: most of what sessions before saw is not."""
-
-    def __init__(self, summaries: Mapping[int, ChunkSummary]) -> None:
-        self._summaries = summaries
-
-    def __missing__(self, chunk_id: int) -> ChunkShapes:
-        return self.setdefault(chunk_id, self._summaries[chunk_id].shapes)
-
-
 class Places:
     """The groups of local instances as places of instances, numbered."""
 
@@ -81,20 +70,16 @@ class Places:
     ) -> None:
         self.groups = groups
         self.rows = {c.chunk_id: c for c in chunks}
-        self.shapes = _Shapes(summaries)
+        self._shapes = cache(lambda chunk_id: summaries[chunk_id].shapes)
         self.unit = world_unit(chunks, summaries)
         self.ties = SessionTies(store.edges.all(), self.rows)
         self._upright = store.facts.gravity != "unknown"
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
-        self._views: dict[tuple[int, int], list[DepthView]] = {}
-        self._light: dict[int, LightBetween] = {}
-        self._share: dict[tuple[Key, int, bool], float] = {}
-        self._extents: dict[int, Array] = {}
-        self._sights: dict[tuple[int, int], Array] = {}
-        self._stayed: dict[tuple[int, int], OrientedBox] = {}
-        self._frames: dict[tuple[int, int], int] = {}
-        self._summaries: dict[int, tuple[float, Array]] = {}
+        self._views_of, self._sights = cache(self._read_views), cache(self._read_sights)
+        self.light, self.extent, self.frames_in = cache(self._light_in), cache(self._box_round), cache(self._frames_in)
+        self._member_changed, self._summed_up = cache(self._changed_of_member), cache(self._sum_up)
+        self._stayed_box = cache(self._box_in)
         self._structure = store.local_instances.structure(sorted(self.rows))
         self._picture = lru_cache(_PICTURES)(self._read_picture)
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
@@ -118,18 +103,15 @@ class Places:
         """
         if len(members) < 2:
             return members
-        shares = np.array([self._shares(key, n, session, before=before) for key in members])
+        shares = np.array([self._member_changed(key, n, session, before) for key in members])
         common = float(np.average(shares, weights=[len(self._points_of(key)) + 1 for key in members]))
         if common < self._s.seen_through / 2:
             return members
         return [k for k, share in zip(members, shares.tolist(), strict=True) if share >= self._s.pure * common]
 
-    def _shares(self, key: Key, n: int, session: int, *, before: bool) -> float:
+    def _changed_of_member(self, key: Key, n: int, session: int, before: bool) -> float:
         """Return the share of the surface of one member that is seen through."""
-        name = (key, session, before)
-        if name not in self._share:
-            self._share[name] = self._changed(self._points_of(key), n, session, before=before)
-        return self._share[name]
+        return self._changed(self._points_of(key), n, session, before=before)
 
     def points(self, n: int, session: int, *, before: bool, stayed: bool = False) -> Array:
         """Return some surface points, world coordinates. Shape (N, 3)."""
@@ -146,13 +128,14 @@ class Places:
     def box(self, n: int, session: int, *, before: bool, stayed: bool = False) -> OrientedBox:
         """Return the box of what was seen of it; unless it has stayed, of what of that has changed."""
         if stayed:
-            name = n, self._told_by(n, session, before=before)
-            if name not in self._stayed:
-                self._stayed[name] = self._box_of(n, self.points(n, session, before=before, stayed=True))
-            return self._stayed[name]
+            return self._stayed_box(n, self._told_by(n, session, before=before))
         points = self.points(n, session, before=before)
         views = self._views_across(n, session, before=before)
         return self._box_of(n, self._with_foot(points, self._changed_rows(points, views)))
+
+    def _box_in(self, n: int, session: int) -> OrientedBox:
+        """Return the box of all that a session saw of it."""
+        return self._box_of(n, self.points(n, session, before=False, stayed=True))
 
     def _box_of(self, n: int, points: Array) -> OrientedBox:
         upright = self._upright and self.component[n] == self._first
@@ -160,12 +143,12 @@ class Places:
 
     def out_of_sight(self, n: int, session: int) -> bool:
         """Return whether no frame of a session can tell about any surface of an instance."""
-        name = session, self.component[n]
-        if name not in self._sights:
-            self._sights[name] = in_sight_of(self._views_of(*name), self._s.visibility)
         low, high = self.extent(n)
-        sights = self._sights[name]
+        sights = self._sights(session, self.component[n])
         return not bool(np.all((sights[:, 0] <= high) & (sights[:, 1] >= low), axis=1).any())
+
+    def _read_sights(self, session: int, component: int) -> Array:
+        return in_sight_of(self._views_of(session, component), self._s.visibility)
 
     def far_apart(self, n: int, m: int) -> bool:
         """Return whether two instances lie so far apart that no surface of `n` meets `m`, or lies in the box of `m`.
@@ -177,15 +160,12 @@ class Places:
         reach = 2.0 * np.linalg.norm(b[1] - b[0]) + meets
         return bool(np.any((a[0] > b[1] + reach) | (a[1] < b[0] - reach)))
 
-    def extent(self, n: int) -> Array:
+    def _box_round(self, n: int) -> Array:
         """Return the box round all that was ever seen of an instance, world coordinates; NaN where there is nothing.
         Shape (2, 3).
         """
-        if n not in self._extents:
-            points = np.concatenate([self._points_of(key) for key in self.groups[n]])
-            found = [points.min(axis=0), points.max(axis=0)] if len(points) else np.full((2, 3), np.nan)
-            self._extents[n] = np.array(found)
-        return self._extents[n]
+        points = np.concatenate([self._points_of(key) for key in self.groups[n]])
+        return np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.full((2, 3), np.nan)
 
     def inside(self, n: int, box: OrientedBox, slack_m: float, session: int, *, before: bool) -> float:
         """Return the share of its surface points that lie in a box."""
@@ -280,7 +260,7 @@ class Places:
 
     def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
         lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)
-        shares = (seen_through_share(points, views, self._s.visibility) for views in lists)
+        shares = (seen_through_shares([points], views, self._s.visibility)[0] for views in lists)
         return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:
@@ -305,7 +285,7 @@ class Places:
             keys = keys if stayed else self._pure(n, keys, session, before=True)
         else:
             keys = self.members(n, session, before=False, stayed=stayed)
-        weight = np.array([max(int(self.shapes[k].areas_px[self._at(k, i)].max(initial=0)), 1) for k, i in keys], float)
+        weight = np.array([self._shapes(k).areas_px[self._at(k, i)].max(initial=1) for k, i in keys], float)
         views = [] if stayed else self._views_across(n, session, before=before)
         rgb = [self._colors_of(key)[self._changed_rows(self._points_of(key), views)] for key in keys]
         light = self.light(session) if before else SAME_LIGHT
@@ -318,25 +298,17 @@ class Places:
         color = float(np.linalg.norm((lab_a - lab_b) * HALF_LIGHT))
         return ratio > self._s.other_size or color > self._s.other_color
 
-    def _summed_up(self, n: int) -> tuple[float, Array]:
-        if n not in self._summaries:
-            rows = [(self.shapes[k], self._at(k, i)) for k, i in self.groups[n]]
-            sizes, labs = [shape.size[at] / shape.unit for shape, at in rows], [shape.lab[at] for shape, at in rows]
-            self._summaries[n] = float(np.median(sizes)), np.median(labs, axis=0)
-        return self._summaries[n]
+    def _sum_up(self, n: int) -> tuple[float, Array]:
+        rows = [(self._shapes(k), self._at(k, i)) for k, i in self.groups[n]]
+        sizes, labs = [shape.size[at] / shape.unit for shape, at in rows], [shape.lab[at] for shape, at in rows]
+        return float(np.median(sizes)), np.median(labs, axis=0)
 
-    def light(self, session: int) -> LightBetween:
+    def _light_in(self, session: int) -> LightBetween:
         """Return how the colours of the sessions before come out in a session, by what both have seen."""
-        if session not in self._light:
-            before, after = [np.zeros((0, 3), np.uint8)], [np.zeros((0, 3), np.uint8)]
-            for n, sessions in enumerate(self.sessions):
-                if session in sessions and sessions[0] < session:
-                    a, b = self._meeting(n, n, session)
-                    before.append(a)
-                    after.append(b)
-            light = LightBetween.of(np.concatenate(before), np.concatenate(after))
-            self._light[session] = light or SAME_LIGHT
-        return self._light[session]
+        seen_again = [n for n, sessions in enumerate(self.sessions) if session in sessions and sessions[0] < session]
+        nothing = np.zeros((0, 3), np.uint8)
+        before, after = zip((nothing, nothing), *(self._meeting(n, n, session) for n in seen_again), strict=True)
+        return LightBetween.of(np.concatenate(before), np.concatenate(after)) or SAME_LIGHT
 
     def other_surface(self, n: int, m: int, session: int) -> bool:
         """Return whether a new instance `m` lies where the surface of `n` was, in other colours."""
@@ -363,7 +335,7 @@ class Places:
         """Return the weighted median over its whole views, so that what one view took from its surroundings does not
         count.
         """
-        whole = [self.shapes[k].truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
+        whole = [self._shapes(k).truncated[self._at(k, i)] < self._s.most_truncated for k, i in keys]
         sizes, weights = [], []
         for key, is_whole, w in zip(keys, whole, weight, strict=True):
             points = self._points_of(key)
@@ -410,12 +382,10 @@ class Places:
         """Return frames of earlier sessions in which an instance was seen."""
         return sum(self.frames_in(n, s) for s in self.sessions[n] if s < before)
 
-    def frames_in(self, n: int, session: int) -> int:
+    def _frames_in(self, n: int, session: int) -> int:
         """Return frames of one session's recording in which an instance was seen."""
-        if (n, session) not in self._frames:
-            own = [self.shapes[k].stands_for for k, _ in self.groups[n] if self.rows[k].session_id == session]
-            self._frames[n, session] = max(own, default=1) * len({f for _, f in self._sightings(n, session)})
-        return self._frames[n, session]
+        own = [self._shapes(k).stands_for for k, _ in self.groups[n] if self.rows[k].session_id == session]
+        return max(own, default=1) * len({f for _, f in self._sightings(n, session)})
 
     def evidence(self, n: int, session: int) -> tuple[tuple[int, int], ...]:
         """Return the frames of a session that see most of an instance."""
@@ -428,29 +398,26 @@ class Places:
         out = []
         for chunk_id, local_id in self.groups[n]:
             if self.rows[chunk_id].session_id == session:
-                shape, at = self.shapes[chunk_id], self._at(chunk_id, local_id)
+                shape, at = self._shapes(chunk_id), self._at(chunk_id, local_id)
                 out += [(int(a), int(f)) for a, f in zip(shape.areas_px[at], shape.frames[at], strict=True)]
         return out
 
-    def _views_of(self, session: int, component: int) -> list[DepthView]:
-        if (session, component) not in self._views:
-            rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
-            keyframes = {c.chunk_id: self._store.keyframes.of(c.chunk_id) for c in rows}
-            self._views[session, component] = views_of(rows, keyframes, self.unit)
-        return self._views[session, component]
+    def _read_views(self, session: int, component: int) -> list[DepthView]:
+        rows = [c for c in self.rows.values() if c.session_id == session and c.component == component]
+        return [view for c in rows for view in chunk_views(c, self._store.keyframes.of(c.chunk_id), self.unit)]
 
     def _points_of(self, key: Key) -> Array:
-        shape, at = self.shapes[key[0]], self._at(*key)
+        shape, at = self._shapes(key[0]), self._at(*key)
         start, stop = np.searchsorted(shape.owner, [at, at + 1])
         return np.asarray(self.rows[key[0]].S_world_chunk.apply(shape.points[start:stop]))
 
     def _colors_of(self, key: Key) -> Colors:
-        shape, at = self.shapes[key[0]], self._at(*key)
+        shape, at = self._shapes(key[0]), self._at(*key)
         start, stop = np.searchsorted(shape.owner, [at, at + 1])
         return shape.rgb[start:stop]
 
     def _at(self, chunk_id: int, local_id: int) -> int:
-        return int(np.searchsorted(self.shapes[chunk_id].local_id, local_id))
+        return int(np.searchsorted(self._shapes(chunk_id).local_id, local_id))
 
 
 def _weighted_median(values: Array, weights: Array) -> float:

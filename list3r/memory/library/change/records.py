@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from list3r.memory.core.geometry import OrientedBox
 from list3r.memory.core.records import MergeDecision
-from list3r.memory.library.merging.edges import Key
+from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.visibility import VisibilitySettings
 
 

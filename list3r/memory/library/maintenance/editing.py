@@ -24,55 +24,34 @@ class MemoryEdits:
 
     def merge(self, a: int | Instance, b: int | Instance, *, author: str | None = None) -> EditReport:
         """Say that two instances are one; the older id stays, the other becomes its alias for ever."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.merge(self._writable(), id_of(a), id_of(b), author)
+        return self._edit("merge", id_of(a), id_of(b), author=author)
 
     def split(
         self, instance_id: int | Instance, out: Sequence[tuple[int, int]] | None = None, *, author: str | None = None
     ) -> EditReport:
         """Say that an instance is two. The local instances `out` (chunk id, local id) leave it; by default those that
         the evidence separates best."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.split(self._writable(), id_of(instance_id), out, author)
+        return self._edit("split", id_of(instance_id), out, author=author)
 
     def label(self, instance_id: int | Instance, text: str | None, *, author: str | None = None) -> EditReport:
         """Name an instance; None takes the name away."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.label(self._writable(), id_of(instance_id), text, author)
+        return self._edit("label", id_of(instance_id), text, author=author)
 
     def name_room(self, room: int, text: str | None, *, author: str | None = None) -> EditReport:
         """Name a room by its id; None takes the name away, and what stands in it names it again."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.name_room(self._writable(), room, text, author)
+        return self._edit("name_room", room, text, author=author)
 
     def delete(self, instance_id: int | Instance, *, author: str | None = None) -> EditReport:
         """Remove an instance, also from later sessions."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.delete(self._writable(), id_of(instance_id), author)
+        return self._edit("delete", id_of(instance_id), author=author)
 
     def scale(self, anchor: str, *, author: str | None = None) -> EditReport:
         """Give a known length, like `12=0.095m` or `camera_height=1.5m`; lengths are metres from then on."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.scale(self._writable(), anchor, author)
+        return self._edit("scale", anchor, author=author)
 
     def undo(self, entry: int | None = None, *, author: str | None = None) -> EditReport:
         """Undo an edit or a decision of the merge log by its entry; by default the last edit that is not undone."""
-        from list3r.memory.library.maintenance import edits
-
-        with self._lock:
-            return edits.undo(self._writable(), entry, author)
+        return self._edit("undo", entry, author=author)
 
     def merges(self, instance_id: int | Instance | None = None) -> list[LogEntry]:
         """Return the merge log, oldest first, or only the entries of one instance. Raises `UnknownIdError`."""
@@ -81,7 +60,11 @@ class MemoryEdits:
         with self._lock:
             return merge_log(self.store, None if instance_id is None else id_of(instance_id))
 
-    def _writable(self) -> Store:
-        if not self.store.writable:
-            raise MemoryFileError(f"{self.store.path} is open for reading; open it with writable=True to edit it")
-        return self.store
+    def _edit(self, verb: str, *arguments: Any, author: str | None) -> EditReport:
+        from list3r.memory.library.maintenance import edits
+
+        with self._lock:
+            if not self.store.writable:
+                raise MemoryFileError(f"{self.store.path} is open for reading; open it with writable=True to edit it")
+            report: EditReport = getattr(edits, verb)(self.store, *arguments, author)
+            return report

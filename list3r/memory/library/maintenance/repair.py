@@ -214,15 +214,19 @@ def _salvage(damaged: Database, store: Store, lost: _Lost) -> None:
     _drop_orphans(kept, lost)
     with store.transaction():
         for name, rows in kept.items():
-            columns = tables()[name][0]
-            statement = f"INSERT INTO {name} ({', '.join(columns)}) VALUES ({','.join('?' * len(columns))})"
-            for key, row in rows.items():
-                try:
-                    store.connection.execute(statement, row)
-                except apsw.ConstraintError:  # what no row may hold
-                    lost.add(name, key)
+            _insert(store, name, rows, lost)
         store.instances.index_again()
         _stand_in_for_lost(store, lost)
+
+
+def _insert(store: Store, name: str, rows: dict[Row, Row], lost: _Lost) -> None:
+    columns = tables()[name][0]
+    statement = f"INSERT INTO {name} ({', '.join(columns)}) VALUES ({','.join('?' * len(columns))})"
+    for key, row in rows.items():
+        try:
+            store.connection.execute(statement, row)
+        except apsw.ConstraintError:  # what no row may hold
+            lost.add(name, key)
 
 
 class _Rows:

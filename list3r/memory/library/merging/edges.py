@@ -13,19 +13,8 @@ from list3r.memory.core.geometry import Array
 from list3r.memory.core.records import MergeDecision
 from list3r.memory.library.merging.nodes import Nodes
 from list3r.memory.library.merging.settings import MergeSettings
-from list3r.memory.library.overlap.pair_scores import Key, PairScores, PairTable, box_iou, pair_scores
+from list3r.memory.library.overlap.pair_scores import Key, PairTable
 from list3r.memory.library.overlap.voxels import Ints
-
-__all__ = [
-    "Key",
-    "Links",
-    "MergeSettings",
-    "PairScores",
-    "box_iou",
-    "form_groups",
-    "links_of",
-    "pair_scores",
-]
 
 NONE, SAME, PART, PLANE = -1, 0, 1, 2
 """What two local instances that meet may be: nothing to each other, or one instance for one of three reasons."""

@@ -143,7 +143,7 @@ def join_movers(
 
 
 @dataclass(frozen=True)
-class _Edge:
+class _MoverEdge:
     """Two nodes that may be one instance."""
 
     a: int
@@ -153,7 +153,7 @@ class _Edge:
     reason: str
 
 
-def _edges(nodes: Sequence[_Node], scene: _Scene) -> list[_Edge]:
+def _edges(nodes: Sequence[_Node], scene: _Scene) -> list[_MoverEdge]:
     """Return what ties the nodes that move to others of their session and component, best first, ties by number."""
     out = []
     moving = [n for n, node in enumerate(nodes) if node.moves]
@@ -163,7 +163,7 @@ def _edges(nodes: Sequence[_Node], scene: _Scene) -> list[_Edge]:
         if x.session == y.session and scene.component(x) == scene.component(y):
             found = scene.edge(x, y)
             if found is not None:
-                out.append(_Edge(a, b, *found))
+                out.append(_MoverEdge(a, b, *found))
     return sorted(out, key=lambda e: (-e.score, e.a, e.b))
 
 

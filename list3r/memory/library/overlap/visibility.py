@@ -6,8 +6,8 @@ of an instance nor a small error of alignment looks like free space.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,38 +81,14 @@ class PlaceVisibility:
     """Gone, because what is measured there has other colours."""
 
 
-def views_of(chunks: Iterable[ChunkRow], keyframes: Mapping[int, Iterable[Keyframe]], unit: float) -> list[DepthView]:
-    """Return the keyframes of chunks that have depth, as they are placed now; `unit` is a metre in world units."""
-    out = []
-    for c in chunks:
-        for k in keyframes[c.chunk_id]:
-            if k.depth_small.size:
-                S_world_cam = c.S_world_chunk @ Sim3.from_matrix(k.T_chunk_cam)
-                in_chunk = unit / float(c.S_world_chunk.scale)
-                out.append(
-                    DepthView(
-                        c.session_id,
-                        k.frame_index,
-                        S_world_cam.inverse(),
-                        in_chunk,
-                        k.depth_small,
-                        k.camera_small,
-                        c.chunk_id,
-                    )
-                )
+def chunk_views(chunk: ChunkRow, keyframes: Iterable[Keyframe], unit: float) -> list[DepthView]:
+    """Return the keyframes of a chunk that have depth, as it is placed; `unit` is a metre in world units."""
+    out, in_chunk = [], unit / float(chunk.S_world_chunk.scale)
+    for k in (k for k in keyframes if k.depth_small.size):
+        S_cam_world = (chunk.S_world_chunk @ Sim3.from_matrix(k.T_chunk_cam)).inverse()
+        view = DepthView(chunk.session_id, k.frame_index, S_cam_world, in_chunk, k.depth_small, k.camera_small)
+        out.append(replace(view, chunk_id=chunk.chunk_id))
     return out
-
-
-def chunk_views(session_id: int, keyframes: Iterable[Keyframe], unit: float) -> list[DepthView]:
-    """Return the keyframes of one chunk that have depth, with the chunk's own frame as the world; `unit` is a metre
-    there.
-    """
-    kept = [k for k in keyframes if k.depth_small.size]
-    S_cam_chunk = [Sim3.from_matrix(k.T_chunk_cam).inverse() for k in kept]
-    return [
-        DepthView(session_id, k.frame_index, S, unit, k.depth_small, k.camera_small)
-        for k, S in zip(kept, S_cam_chunk, strict=True)
-    ]
 
 
 OtherSurface = Callable[[DepthView, Array, Ints], NDArray[np.bool_]]
@@ -196,17 +172,12 @@ def tally(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> t
     return free, met
 
 
-def seen_through_share(points: Array, views: Iterable[DepthView], s: VisibilitySettings) -> float | None:
-    """Return the share of a surface that more frames see through than see, of what they tell of; None where that is too
-    little.
-    """
-    return seen_through_shares([points], views, s)[0]
-
-
 def seen_through_shares(
     surfaces: Sequence[Array], views: Iterable[DepthView], s: VisibilitySettings
 ) -> list[float | None]:
-    """Return the same of several surfaces, about which each frame is asked once."""
+    """Return of each of several surfaces the share that more frames see through than see, of what they tell of; None
+    where that is too little.
+    """
     free, met = tally(np.concatenate(surfaces), views, s)
     ends = np.cumsum([len(points) for points in surfaces])
     out: list[float | None] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
@@ -60,9 +61,7 @@ class RelationScene:
         self._measured = measured
         self.unit = unit
         self.s = settings
-        self._trees: dict[int, cKDTree] = {}
-        self._plans: dict[int, Footprint] = {}
-        self._surfaces: dict[int, SampledSurface] = {}
+        self.tree, self.plan, self.surface = cache(self._tree_of), cache(self._seen_from_above), cache(self._sampled)
         low = np.array([b.aabb[0] for b in instances]).reshape(-1, 3)
         high = np.array([b.aabb[1] for b in instances]).reshape(-1, 3)
         gap = np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None]))
@@ -77,13 +76,11 @@ class RelationScene:
         self.size = np.array([b.size for b in instances])
         self.in_room = np.array([b.structure is None for b in instances], dtype=bool)
 
-    def tree(self, n: int) -> cKDTree:
+    def _tree_of(self, n: int) -> cKDTree:
         """Return the KD-tree of an instance's points."""
         from scipy.spatial import cKDTree
 
-        if n not in self._trees:
-            self._trees[n] = cKDTree(self.instances[n].points)
-        return self._trees[n]
+        return cKDTree(self.instances[n].points)
 
     def measure(self, what: str, a: int, b: int, compute: Callable[[RelationScene, int, int], T]) -> T:
         """Return a measure of two instances, from memory where it is known."""
@@ -97,30 +94,26 @@ class RelationScene:
         """Return the distance between surfaces."""
         return self.measure("upright gap" if self._upright else "gap", min(a, b), max(a, b), _gap)
 
-    def surface(self, n: int) -> SampledSurface:
+    def _sampled(self, n: int) -> SampledSurface:
         """Return what is known of an instance's surface: its points, and for what is round its hidden sides too."""
         from scipy.spatial import cKDTree
 
-        if n not in self._surfaces:
-            points = self.instances[n].points
-            axis = self.measure("axis", n, n, _axis) if self._upright and self.in_room[n] else None
-            if axis is not None:
-                points = turned(points[:: -(-len(points) // _TURNED)], axis)
-            tree = self.tree(n) if axis is None else cKDTree(points)
-            away = neighbours_of(points[:: max(1, len(points) // 100)], tree, min(_COMPANY + 1, len(points)))[0]
-            grain, company = np.median(away[:, min(1, away.shape[1] - 1)]), np.median(away[:, -1])
-            self._surfaces[n] = SampledSurface(points, tree, float(grain), float(company))
-        return self._surfaces[n]
+        points = self.instances[n].points
+        axis = self.measure("axis", n, n, _axis) if self._upright and self.in_room[n] else None
+        if axis is not None:
+            points = turned(points[:: -(-len(points) // _TURNED)], axis)
+        tree = self.tree(n) if axis is None else cKDTree(points)
+        away = neighbours_of(points[:: max(1, len(points) // 100)], tree, min(_COMPANY + 1, len(points)))[0]
+        grain, company = np.median(away[:, min(1, away.shape[1] - 1)]), np.median(away[:, -1])
+        return SampledSurface(points, tree, float(grain), float(company))
 
-    def plan(self, n: int) -> Footprint:
+    def _seen_from_above(self, n: int) -> Footprint:
         """Return an instance as it is seen from above."""
         from scipy.spatial import cKDTree
 
-        if n not in self._plans:
-            points = self.instances[n].points
-            sample = points[:: -(-len(points) // _SAMPLE)]
-            self._plans[n] = Footprint(sample, cKDTree(sample[:, :2]), spacing_of(sample))
-        return self._plans[n]
+        points = self.instances[n].points
+        sample = points[:: -(-len(points) // _SAMPLE)]
+        return Footprint(sample, cKDTree(sample[:, :2]), spacing_of(sample))
 
 
 def _touch(scene: RelationScene, a: int, b: int) -> float:

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from list3r.memory.core.geometry import Array, Sim3, skew
+from list3r.memory.core.geometry import Array, Sim3, stack
 from list3r.memory.core.records import ChunkRow, Edge
+from list3r.memory.library.uncertainty import point_covariances
 
 
 def keyframes_of(edge: Edge, session_of: Mapping[int, int]) -> set[tuple[int, int]]:
@@ -72,7 +73,5 @@ class SessionTies:
 
 def _of_place(S_world_u: Sim3, covariance: Array, at: Array) -> Array:
     """Return the covariance of a place (3,), world units, by that of x in S_true = S_v_u exp(x). Shape (3, 3)."""
-    p = S_world_u.inverse().apply(at[None])[0]
-    moves = float(S_world_u.scale) * S_world_u.rotation @ np.concatenate([np.eye(3), -skew(p), p[:, None]], axis=1)
-    spread = moves @ covariance @ moves.T
+    spread = point_covariances(stack([S_world_u]), covariance, at[None])[0]
     return np.asarray(spread + 1e-12 * max(float(np.trace(spread)), 1e-12) * np.eye(3))

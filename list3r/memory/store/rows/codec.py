@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import zlib
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,14 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.core.errors import MemoryFileError
 from list3r.memory.core.geometry import Sim3
-from list3r.memory.core.unpacking import open_archive
-from list3r.memory.store.rows.npz import read_members, write_npz
+from list3r.memory.core.unpacking import parse_json
 
 MAX_BLOB_BYTES = 256 * 2**20
 """No array of one row is larger than this; a blob that claims more is damaged or hostile."""
 
-MAX_ARRAYS = 256
-"""No row keeps more arrays under names of their own than this."""
+_LEVEL = 4
+"""Of compression: a third of the time of the usual 6, files 3 % larger."""
 
 
 def checksum(*blobs: bytes) -> int:
@@ -34,8 +31,14 @@ def checksum(*blobs: bytes) -> int:
 
 
 def pack(arrays: Mapping[str, ArrayLike]) -> bytes:
-    """Named arrays as a compressed `.npz`; the same arrays give the same bytes."""
-    return write_npz({k: np.asarray(v) for k, v in arrays.items()})
+    """Named arrays of numbers and booleans, compressed: a line of JSON with names, types and shapes, then the arrays
+    one after the other. The same arrays give the same bytes.
+    """
+    held = {k: np.asarray(v) for k, v in arrays.items()}
+    assert all(v.dtype.kind in "biuf" for v in held.values())
+    line = json.dumps([(k, v.dtype.newbyteorder("<").str, v.shape) for k, v in held.items()], separators=(",", ":"))
+    parts = (v.astype(v.dtype.newbyteorder("<"), copy=False).tobytes() for v in held.values())
+    return zlib.compress(b"".join((line.encode(), b"\n", *parts)), _LEVEL)
 
 
 def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
@@ -44,42 +47,22 @@ def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
     Only numbers and booleans are read, and an array takes no more memory than the bytes that are really there.
     """
     try:
-        members = read_members(blob, MAX_BLOB_BYTES, MAX_ARRAYS)
-        if members is not None:
-            return {name.removesuffix(".npy"): _read_npy(data) for name, data in members.items()}
-        with open_archive(io.BytesIO(blob)) as archive:
-            entries = archive.infolist()
-            if sum(entry.file_size for entry in entries) > MAX_BLOB_BYTES or len(entries) > MAX_ARRAYS:
-                raise MemoryFileError(f"{where} claims more than {MAX_BLOB_BYTES >> 20} MiB; the file is damaged")
-            return {e.filename.removesuffix(".npy"): _read_npy(archive.read(e)) for e in entries}
-    except MemoryFileError:
-        raise
-    except Exception as error:  # what zipfile and NumPy raise on damaged bytes is not a closed list
+        stream = zlib.decompressobj()
+        data = stream.decompress(blob, MAX_BLOB_BYTES)
+        if not stream.eof:
+            raise ValueError(f"cut off, or more than {MAX_BLOB_BYTES >> 20} MiB")
+        out, at = {}, data.index(b"\n") + 1
+        for name, kind, shape in parse_json(data[:at]):
+            dtype, count = np.dtype(kind), math.prod(shape)
+            if dtype.kind not in "biuf" or dtype.fields is not None or any(n < 0 for n in shape):
+                raise ValueError(f"an array of {dtype}")
+            out[name] = np.frombuffer(bytearray(data[at : at + count * dtype.itemsize]), dtype).reshape(shape)
+            at += count * dtype.itemsize
+        if at != len(data):
+            raise ValueError(f"{len(data)} bytes instead of {at}")
+        return out
+    except (ValueError, TypeError, SyntaxError, OverflowError, zlib.error) as error:
         raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error
-
-
-def _read_npy(data: bytes) -> NDArray[Any]:
-    """An array in NumPy's format 1 or 2. Raises `ValueError` when it is not one, or its header does not fit."""
-    major = int(data[6]) if len(data) > 10 and data[:6] == b"\x93NUMPY" else 0
-    start = {1: 10 + int.from_bytes(data[8:10], "little"), 2: 12 + int.from_bytes(data[8:12], "little")}.get(major, 0)
-    shape, fortran, dtype = _npy_header(data[:start])
-    if dtype.kind not in "biuf" or dtype.fields is not None or any(n < 0 for n in shape):
-        raise ValueError(f"an array of {dtype}")
-    if math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{len(data) - start} bytes for an array of shape {shape}")
-    flat: NDArray[Any] = np.frombuffer(bytearray(data[start:]), dtype=dtype)
-    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
-
-
-@lru_cache(maxsize=512)
-def _npy_header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, order and type; most arrays of a memory have one of a few headers."""
-    buffer = io.BytesIO(header)
-    version = np.lib.format.read_magic(buffer)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise ValueError(f"an array in format {version}")
-    return readers[version](buffer)
 
 
 def pack_sim3(transform: Sim3) -> bytes:

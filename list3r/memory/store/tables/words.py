@@ -68,16 +68,6 @@ class Words:
         chosen = [(sum(w for w, _ in c), " AND ".join(f"({m})" for _, m in c) + rest) for c in product(*columns)]
         return sorted(chosen, key=lambda c: -c[0])
 
-    def bearing_most(self, words: Sequence[str], limit: int) -> list[list[int]]:
-        """Ids of the instances that have some words or, of three letters on, words that begin so: those that have the
-        most of them first, one list for each number of words. At most `limit` ids are looked at for each word.
-        """
-        hits: dict[int, int] = {}
-        for word in dict.fromkeys(words):
-            for instance in self._ids(_quoted(word) + " *" * (len(word) >= 3), limit) if word else ():
-                hits[instance] = hits.get(instance, 0) + 1
-        return [sorted(n for n, c in hits.items() if c == most) for most in sorted(set(hits.values()), reverse=True)]
-
     def _ids(self, match: str, limit: int) -> list[int]:
         query = "SELECT rowid FROM words WHERE words MATCH ? ORDER BY rowid LIMIT ?"
         return [n for (n,) in self._connection.rows(query, (match, limit))]
