@@ -398,7 +398,7 @@ def test_what_is_only_known_to_be_a_seat_is_told_so_and_found_after_the_chairs(
         assert store.detected_labels.all()[red].level == "branch" and store.instances.get(red).label == "seat"
         assert find(store, "seat")[0].instance.id == red
         assert find(store, "how many chairs are there?").counted == 1
-    assert run(["query", "find", str(memory), "chair", "--json"]) == 0
+    assert run(["find", str(memory), "chair", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["matches"]
     assert [r["id"] for r in rows] == [green, red] and rows[1]["score"] < 0.5 < rows[0]["score"]
     assert "may be a chair" in rows[1]["reason"]
