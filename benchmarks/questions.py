@@ -42,7 +42,7 @@ class Asked:
 
     question: str
     answer: str
-    """Keys of things (#ID in the demo) that may come first; =N for a count; yes, no; none where nothing fits."""
+    """Keys of things that may come first; =N for a count; yes, no; none where nothing fits."""
     place: str | None
     """Viewpoint x,y,z."""
 
@@ -132,6 +132,15 @@ def judge(memory: Any, asked: Asked, keys: dict[int, str]) -> Judged:
     return Judged(asked.question, wanted, said, None if first is None else first.score, verdict, seconds)
 
 
+def keys_at(path: Path, name: str, near_m: float = 0.25) -> dict[int, str]:
+    """Return the key of each thing whose centre is at one of a table of places: ids are others in each build."""
+    rows = read_table(name)
+    places = np.array([[float(r[k]) for k in "xyz"] for r in rows])
+    with list3r.open(path) as memory:
+        off = {i.id: np.linalg.norm(places - i.center, axis=1) for i in memory}
+    return {n: rows[int(d.argmin())]["key"] for n, d in off.items() if d.min() <= near_m}
+
+
 def judged(path: Path, name: str, keys: dict[int, str]) -> list[Judged]:
     """Ask the questions of a table."""
     with list3r.open(path) as memory:
@@ -165,7 +174,7 @@ def main() -> None:
         path, keys = make_room(Path(folder))
         sets = {"room": judged(path, "room_unseen.tsv" if options.unseen else "room_questions.tsv", keys)}
     if options.demo is not None:
-        sets["demo"] = judged(options.demo, "demo_questions.tsv", {})
+        sets["demo"] = judged(options.demo, "demo_questions.tsv", keys_at(options.demo, "demo.tsv"))
     for name, rows in sets.items():
         print(name, summary(rows))
         for r in rows:

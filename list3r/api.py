@@ -24,7 +24,7 @@ from list3r.memory.core.records import Instance, id_of
 from list3r.memory.library.maintenance.editing import MemoryEdits
 from list3r.memory.library.world.scale import Lengths, lengths_of
 from list3r.memory.store.store import Store
-from list3r.queries.answers import Answers
+from list3r.queries.answers import Answers, Rows
 
 if TYPE_CHECKING:
     import networkx
@@ -65,7 +65,7 @@ def _alone(method: Callable[Concatenate[SceneMemory, P], R]) -> Callable[Concate
         # An answer must see one state while another process writes; a writer has none beside it.
         with naming_extras(), self._lock, nullcontext() if self.store.writable else self.store.snapshot():
             answer = method(self, *args, **kwargs)
-            if isinstance(answer, Answers):
+            if isinstance(answer, Rows):
                 answer.picture_of = self._thumbnail
             return answer
 
@@ -594,11 +594,11 @@ class SceneMemory(MemoryEdits):
         return relations(self.store, a, predicate, b, min_confidence, viewpoint=seen_from, other=c)
 
     @_alone
-    def relations_of(self, instance_id: int | Instance) -> Answers[Relation]:
+    def relations_of(self, instance_id: int | Instance) -> Rows[Relation]:
         """Return the stored relations of an instance, each once: `on`, but not its inverse `supports`."""
         from list3r.queries.relations import relations_of
 
-        return Answers(relations_of(self.store, self.store.instances.get(id_of(instance_id)).id))
+        return Rows(relations_of(self.store, self.store.instances.get(id_of(instance_id)).id))
 
     @_alone
     def measure(self, a: int | Instance, b: int | Instance) -> InstanceDistance:

@@ -142,6 +142,25 @@ def test_what_is_gone_is_gone_wherever_the_sessions_may_lie(tmp_path: Path) -> N
         assert _tied(tmp_path / f"{sigma_m[2]}.l3r", _without("red"), sigma_m) == told
 
 
+@pytest.mark.parametrize(("aside_m", "times", "told"), [(0.0, 2, ["removed"]), (0.9, 2, []), (0.0, 0.34, [])])
+def test_what_is_removed_was_looked_for_as_a_whole_and_often(
+    tmp_path: Path, aside_m: float, times: float, told: list[str]
+) -> None:
+    """Frames that see through one side of a stool tell nothing of the other, and a few may see past it."""
+    with Store.create(tmp_path / "a.l3r") as store:
+        stool = ROOM["stool"].center
+        for room, aside, turn, repeat in ((dict(ROOM), 0.0, 1.6, 2.0), (_without("stool"), aside_m, 0.04, times)):
+            with store.transaction():
+                path = cameras((stool[0] + aside, *stool[1:]), 1.55 - turn / 2, turn)
+                path = np.concatenate([path] * 2)[: int(repeat * len(path))]
+                add_session(store, room, path)
+                place_together(store)
+                consolidate(store)
+        assert [e.kind for e in store.events.all(2) if e.kind != "seen_again"] == told
+        gone = [i for i in store.instances.all() if np.linalg.norm(i.box.center - stool) < 0.3]
+        assert [i.state for i in gone] == (told or ["unseen"])
+
+
 def _without(name: str) -> dict[str, Box]:
     return {k: b for k, b in ROOM.items() if k != name}
 

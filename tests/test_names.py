@@ -51,12 +51,22 @@ def test_a_detector_overrules_the_discoverer() -> None:
     assert silent is not None and silent[0] == "chair"
 
 
-def test_what_only_the_discoverer_says_must_be_surer_than_what_a_detector_says() -> None:
-    votes = votes_of_probabilities([("chair", 0.6)])
+def test_what_a_detector_says_must_be_surer_than_what_only_the_discoverer_says() -> None:
+    votes = votes_of_probabilities([("chair", 0.75)])
     assert decide({"detector": votes}) is not None
-    assert decide_by_rank({"detector": votes}) is not None and decide_by_rank({OWN_NAMES: votes}) is None
-    lenient = replace(LabelSettings(), min_own=0.5)
-    assert decide_by_rank({OWN_NAMES: votes}, settings=lenient) == decide({OWN_NAMES: votes})
+    assert decide_by_rank({"detector": votes}) is None
+    assert decide_by_rank({OWN_NAMES: votes}) == decide({OWN_NAMES: votes})
+    lenient = replace(LabelSettings(), min_detected=0.5)
+    assert decide_by_rank({"detector": votes}, settings=lenient) == decide({"detector": votes})
+    assert decide_by_rank({OWN_NAMES: votes_of_probabilities([("chair", 0.6)])}) is None
+
+
+def test_an_unsure_detector_adds_no_name_and_takes_one_away_that_it_doubts() -> None:
+    detector, own = (votes_of_probabilities([("chair", p)]) for p in (0.75, 0.55))
+    assert decide_by_rank({OWN_NAMES: own, "detector": detector}) is None
+    sure, other = votes_of_probabilities([("chair", 0.75)]), votes_of_probabilities([("table", 0.75)])
+    assert decide_by_rank({OWN_NAMES: sure}) is not None
+    assert decide_by_rank({OWN_NAMES: sure, "detector": other}) is None
 
 
 def test_names_that_are_unsure_alone_make_the_kind_that_they_share_sure() -> None:

@@ -216,6 +216,7 @@ def test_things_become_arrays_tables_and_clouds(memory: SceneMemory) -> None:
     found = memory.find("mug")
     table = found.to_dataframe()
     assert list(table["id"]) == [m.instance.id for m in found] and {"name", "score", "x", "reason"} <= set(table)
+    assert not hasattr(memory.relations(), "boxes") and not hasattr(memory.relations_of(MUG), "boxes")
     assert list(memory.relations().to_dataframe().columns) == ["subject", "predicate", "object", "confidence", "margin"]
     cloud = pytest.importorskip("open3d") and memory.to_open3d(MUG)
     np.testing.assert_allclose(np.asarray(cloud.points), memory.support(MUG).points, atol=1e-6)
@@ -245,6 +246,8 @@ def test_a_notebook_shows_short_tables_with_pictures(tmp_path: Path) -> None:
         answers = Answers(answers)
         answers.picture_of = memory._thumbnail
         assert answers._repr_html_().count("<tr>") == 21 and "100 more" in answers._repr_html_()
+        shown = memory[MUG]._repr_html_()
+        assert "<script>" not in shown and f"<td>{MUG}</td>" in shown and memory[MUG].description in shown
         assert len(repr(answers)) < 4000 and "array(" not in repr(memory[MUG]) + repr(memory.nearest(MUG))
         after = memory.instances()
     assert "<img" not in after._repr_html_() and "mug" in after._repr_html_()

@@ -12,12 +12,14 @@ import list3r
 from list3r.exporters.scene_json import scene_dict, scene_schema
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Doorway, Room
+from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.rooms.derivation import Rooms, _named_as_before, _of_storey
 from list3r.memory.library.rooms.naming import named_rooms
 from list3r.memory.library.rooms.outline import area_of, encloses, outline
 from list3r.memory.library.rooms.space import Grid, Sight
 from list3r.memory.store.store import Store
 from list3r.queries.finding.grammar import IN_ROOM, parse
+from tests.session_scenes import ROOM, add_session, cameras, place_together
 
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
 
@@ -159,3 +161,17 @@ def test_rooms_forget_an_instance_that_is_gone(furnished: Path) -> None:
             store.instances.drop(gone, None)
         assert gone not in named_rooms(store)[0].instances
         assert not any("room" in damage for damage in store.verify())
+
+
+def test_a_doorway_that_is_no_more_is_forgotten(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "a.l3r") as store, store.transaction():
+        add_session(store, ROOM, cameras((0.0, 0.0, 0.75), 0.4))
+        place_together(store)
+        store.facts.gravity = "known"
+        consolidate(store)
+        rooms = store.rooms.all()
+        assert rooms and store.rooms.doorways() == []
+        n = rooms[0].id
+        store.rooms.replace(rooms, [Doorway(n, n + 1, np.zeros(3), 0.9)])
+        consolidate(store)
+        assert store.rooms.doorways() == [] and [r.id for r in store.rooms.all()] == [r.id for r in rooms]

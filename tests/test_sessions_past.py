@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import list3r
 from list3r.cli.app import run
 from list3r.memory.core.errors import OptionError
+from list3r.memory.core.records import Room
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.maintenance.as_of import store_at
 from list3r.memory.store.store import Store
@@ -51,6 +53,18 @@ def ids(memory: Path) -> dict[str, int]:
             min(rooms, key=lambda k: float(np.abs(np.subtract(rooms[k].rgb, i.color_rgb)).sum())): i.id
             for i in store.instances.all()
         }
+
+
+def test_rooms_are_those_of_today_and_a_past_memory_says_so(memory: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(memory, tmp_path / "rooms.l3r"))
+    with Store.open(path, writable=True) as store, store.transaction():
+        inside = tuple(i.id for i in store.instances.all(structure=False))
+        corners = np.array([[-3.0, -3.0], [3.0, -3.0], [3.0, 3.0], [-3.0, 3.0]])
+        store.rooms.replace([Room(1, 0, 0.0, corners, 36.0, "", inside)], [])
+    with list3r.open(path) as today, list3r.open(path, at=1) as then:
+        assert len(today.rooms()) == 1 and today.find("box in room 1").exact
+        assert then.rooms() == [] and then.doorways() == []
+        assert "as it is today" in " ".join(then.find("box in room 1").notes)
 
 
 @pytest.fixture

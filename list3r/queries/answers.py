@@ -21,8 +21,8 @@ _MOST_ROWS = 20
 """Rows of an answer that a notebook shows; each has a picture of a few kB."""
 
 
-class Answers(list[T]):
-    """A list of instances, of what names an instance (matches, changes), or of relations."""
+class Rows(list[T]):
+    """A list of answers, of which each is a row of a table."""
 
     picture_of: Callable[[int], bytes | None] | None = None
     """Returns a small JPEG of an instance, None where no picture shows it; set by the memory that answers."""
@@ -30,15 +30,6 @@ class Answers(list[T]):
     def __repr__(self) -> str:
         more = [f"... {len(self) - _MOST_ROWS} more"] if len(self) > _MOST_ROWS else []
         return "[" + ",\n ".join([*map(repr, self[:_MOST_ROWS]), *more]) + "]"
-
-    @property
-    def boxes(self) -> NDArray[np.float64]:
-        """Lower and upper corner of each, world; relations have none. Shape (N, 2, 3).
-
-        >>> memory.find("chair").boxes[0]
-        """
-        boxes = [i.aabb for i in map(instance_of, self) if i is not None]
-        return np.array(boxes, np.float64).reshape(-1, 2, 3)
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return one row for each answer. Raises `MissingPackageError` without pandas.
@@ -63,6 +54,19 @@ class Answers(list[T]):
         body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row.values()) + "</tr>" for row in rows)
         more = f"<p>{len(self) - _MOST_ROWS} more</p>" if len(self) > _MOST_ROWS else ""
         return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
+
+
+class Answers(Rows[T]):
+    """A list of instances, or of what names an instance: matches, changes."""
+
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """Lower and upper corner of each, world. Shape (N, 2, 3).
+
+        >>> memory.find("chair").boxes[0]
+        """
+        boxes = [i.aabb for i in map(instance_of, self) if i is not None]
+        return np.array(boxes, np.float64).reshape(-1, 2, 3)
 
 
 def instance_of(answer: object) -> Instance | None:

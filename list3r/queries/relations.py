@@ -12,7 +12,7 @@ from list3r.memory.core.records import Instance, Relation
 from list3r.memory.library.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.library.relations.settings import RelationSettings
 from list3r.memory.store.store import Store
-from list3r.queries.answers import Answers
+from list3r.queries.answers import Rows
 from list3r.queries.finding.words import is_named, no_such_words, same_kind, wanted_words
 from list3r.queries.match import checked_instance, checked_point
 from list3r.queries.views.camera import PosedCamera, camera_of_frame, last_camera
@@ -30,7 +30,7 @@ Place = int | str | Sequence[float] | PosedCamera
 """Where to look from: an instance's id, "camera" (where it was last), "camera:FRAME", a point x, y, z, or a camera."""
 
 
-class Relations(Answers[Relation]):
+class Relations(Rows[Relation]):
     """A list of relations with what can be said of the question as a whole."""
 
     def __init__(self, found: Iterable[Relation] = (), state: str = "known", reason: str = "") -> None:

@@ -12,6 +12,10 @@ from list3r.memory.core.records import Doorway, Room
 from list3r.memory.library.rooms.naming import named_rooms, title
 from list3r.memory.store.store import Store
 
+NO_ROOMS = (
+    "a memory has rooms as it is today, and only when its session has ended, up is known and its keyframes have depth"
+)
+
 
 @dataclass(frozen=True)
 class RoomPath:
@@ -23,7 +27,7 @@ class RoomPath:
 
 
 def rooms(store: Store) -> list[Room]:
-    """Return the rooms by id, with their names; none where up is not known or no depth was kept."""
+    """Return the rooms by id, with their names; none where up is not known or no depth was kept, or of the past."""
     return named_rooms(store)
 
 
@@ -38,7 +42,7 @@ def rooms_of(store: Store, room: int | str) -> list[Room]:
     if not found:
         there = ", ".join(title(r) for r in known)
         raise OptionError(
-            f"no room {str(room)!r}; " + (f"there are {there}" if there else f"{store.path} has no rooms")
+            f"no room {str(room)!r}; there are {there}" if there else f"no room {str(room)!r}: {NO_ROOMS}"
         )
     return found
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from list3r.cli.answer import print_answer
-from list3r.cli.common import AtOption, JsonOption, MemoryArgument, open_memory, print_table
+from list3r.cli.common import JsonOption, MemoryArgument, open_memory, print_table
 from list3r.cli.terminal import say
 from list3r.memory.core.errors import OptionError
 
@@ -28,13 +28,13 @@ def rooms(
         str | None, typer.Option("--author", metavar="NAME", help="Author of the name; default: you.")
     ] = None,
     json: JsonOption = False,
-    at: AtOption = None,
 ) -> None:
     """List the rooms with what is in them and their doorways, name one, or find the way between two.
 
     Example: list3r rooms house.l3r --name "2=guest room"
     """
     from list3r.api import open as open_scene
+    from list3r.queries.rooms import NO_ROOMS
 
     if name is not None:
         room, found, text = name.partition("=")
@@ -47,7 +47,7 @@ def rooms(
         else:
             say(report.text)
         return
-    with open_memory(memory, at=at) as scene:
+    with open_memory(memory) as scene:
         if path is not None:
             start, found, end = path.partition(",")
             if not found:
@@ -59,15 +59,18 @@ def rooms(
             print_answer([_entry(r, doorways) for r in listed])
             return
         if not listed:
-            say("no rooms: a memory has some when its session has ended, up is known and its keyframes have depth")
+            say(f"no rooms: {NO_ROOMS}")
             return
         unit = scene.units
+        parts = [i.component for i in scene]
     rows = []
     for r in listed:
         doors = ", ".join(f"{d.b if d.a == r.id else d.a}" for d in doorways if r.id in (d.a, d.b))
         what = "; ".join(x for x in (r.reason, r.partial and f"partial: {r.partial}") if x)
         rows.append([r.id, r.name or "", r.floor, f"{r.area:.1f}", len(r.instances), doors, what])
     print_table(rows, ["room", "name", "floor", f"area ({unit}2)", "things", "doorways to", "why"])
+    if apart := sum(n != min(parts) for n in parts):
+        say(f"{apart} things are in parts that were not joined to the first one; of these up is not known, nor rooms")
 
 
 def _print_way(scene: SceneMemory, start: str, end: str, json: bool) -> None:

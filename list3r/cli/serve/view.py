@@ -21,7 +21,7 @@ def view(
     write: Annotated[bool, typer.Option("--write", help="Allow edits; no other program can write meanwhile.")] = False,
     browser: Annotated[bool, typer.Option(help="Open the browser.")] = True,
 ) -> None:
-    """Show a memory in the browser: points, boxes, names, the camera's path; click, search, measure, go back in time.
+    """Show a memory in the browser: surfaces, things, the camera's path; click, search, measure, go back in time.
 
     Example: list3r view house.l3r
     """

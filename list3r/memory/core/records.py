@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from html import escape
 from typing import Annotated, Any, SupportsInt, cast
 
 import numpy as np
@@ -392,6 +393,18 @@ class Instance:
     def __repr__(self) -> str:
         x, y, z = self.center
         return f"<Instance {self.id}: {self.name} at ({x:.2f}, {y:.2f}, {z:.2f}), confidence {self.confidence:.2f}>"
+
+    def _repr_html_(self) -> str:
+        rows = {
+            "id": str(self.id),
+            "name": self.name,
+            "description": self.description,
+            "centre": ", ".join(f"{v:.2f}" for v in self.center),
+            "size": " x ".join(f"{v:.2f}" for v in self.box.size),
+            "confidence": f"{self.confidence:.2f}",
+            "state": self.state,
+        }
+        return f"<table>{''.join(f'<tr><th>{k}</th><td>{escape(v)}</td></tr>' for k, v in rows.items())}</table>"
 
 
 def id_of(what: SupportsInt | Instance) -> int:

@@ -41,7 +41,7 @@ def write_library(scene: Scene, library: Library, known: Known, chunk_id: int) -
         store.events.replace(events)
     if library.rooms is not None:
         store.facts.last_room = library.rooms.last_id
-        if not _same([*library.rooms.rooms], [*known.rooms.rooms]):
+        if not _same(*([*r.rooms, *r.doorways] for r in (library.rooms, known.rooms))):
             store.rooms.replace(library.rooms.rooms, library.rooms.doorways)
     _log_decisions(store, chunk_id, library.decisions, known.owners, library.ids)
 

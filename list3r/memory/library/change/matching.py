@@ -72,7 +72,7 @@ class ChangeMatching:
                 along = any(self._went_along(placed.now, *way, session) for way in ways)
                 if along or self._scrap(placed.now, left, session, before=True):
                     placed.state = "removed"
-                else:
+                elif self._wholly_gone(placed, found):
                     self._remove(placed, session, found)
         for n in fresh:
             scrap = n in came and self._scrap(n, came, session, before=False)
@@ -127,10 +127,17 @@ class ChangeMatching:
         other = self._displaced_by(placed.now, fresh, session)
         if found.verdict == "gone" or other is not None or self._taken(placed.now, found, fresh, session):
             self._instead.update([] if other is None else [other, placed.now])
-            return found
+            return replace(found, told=p.told(placed.now, other, session))
         if found.verdict == "there" and self._counts[placed.now]:
             self._still_there(placed, session, found)
         return None
+
+    def _wholly_gone(self, placed: PlacedInstance, found: PlaceVisibility) -> bool:
+        """Return whether enough of an instance was looked for to say that it was removed; a glance at one side may go
+        past it.
+        """
+        enough = len(found.frames) >= self._s.removed_frames or placed.now in self._instead
+        return enough and found.told >= self._s.told
 
     def _well_seen(self, n: int, before: int) -> bool:
         return self._p.frames(n, before) >= self._s.least_frames
@@ -138,7 +145,7 @@ class ChangeMatching:
     def _taken(self, n: int, found: PlaceVisibility, fresh: Sequence[int], session: int) -> bool:
         """Return whether something new stands where an instance was: what is not seen through of it lies at that."""
         p, s = self._p, self._s
-        if found.verdict == "unseen" or p.changed(n, session, before=True) < s.seen_through:
+        if len(found.frames) < s.visibility.least_frames or p.changed(n, session, before=True) < s.seen_through:
             return False
         new = [m for m in fresh if p.component[m] == p.component[n]]
         new = [m for m in new if p.changed(m, session, before=False) >= s.seen_through / 2]

@@ -243,20 +243,26 @@ class Places:
         """Return the share of the surface that an instance had which is seen through or lies at what is new there, of
         what is told.
         """
-        from scipy.spatial import cKDTree
-
         points = self.points(n, session, before=True)
         free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
-        known = free + met > 0
-        if not known.any():
-            return 0.0
-        surfaces = [self.points(m, session, before=False) for m in new]
-        near = np.zeros(len(points), bool)
-        if any(len(x) for x in surfaces):
-            reach = self._s.replaced_link_m * self.unit
-            tree = cKDTree(np.concatenate(surfaces))
-            near = np.asarray(tree.query(points, distance_upper_bound=reach)[0] < np.inf)
-        return float(np.mean((near | (free > met))[known]))
+        known, near = free + met > 0, self._at_new(points, new, session)
+        return float(np.mean((near | (free > met))[known])) if known.any() else 0.0
+
+    def told(self, n: int, other: int | None, session: int) -> float:
+        """Return the share of all of the surface that an instance had of which frames tell, or which lies at an `other`
+        instance that has its place: the rest may still be there.
+        """
+        points = self.points(n, session, before=True, stayed=True)
+        free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
+        near = self._at_new(points, [] if other is None else [other], session)
+        return float(np.mean(near | (free + met > 0))) if len(points) else 0.0
+
+    def _at_new(self, points: Array, new: Sequence[int], session: int) -> NDArray[np.bool_]:
+        """Return which points lie at the surface of something new. Shape (N,)."""
+        surfaces = [x for x in (self.points(m, session, before=False) for m in new) if len(x)]
+        if not surfaces:
+            return np.zeros(len(points), bool)
+        return meeting(cKDTree(np.concatenate(surfaces)), points, self._s.replaced_link_m * self.unit)[0]
 
     def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
         lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)

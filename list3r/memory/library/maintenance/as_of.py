@@ -56,6 +56,7 @@ def _show(past: Store, session_id: int, instances: Sequence[Instance]) -> None:
     views = {t: f"session_id <= {last}" for t in _BY_SESSION} | {t: f"chunk_id IN {chunks}" for t in _BY_CHUNK}
     views["edges"] = f"u IN {chunks} AND v IN {chunks}"
     views["observations"] = f"chunk_id IN {chunks} AND instance IN {ids}"
+    views |= dict.fromkeys(("rooms", "room_instances", "doorways"), "0")  # outlines are those of today alone
     views["embeddings"] = views["detected_labels"] = f"instance IN {ids}"
     with past.connection.temporary():
         for table, condition in views.items():

@@ -79,6 +79,8 @@ class PlaceVisibility:
     """(session id, Frame.index) of the frames that told, the most telling first."""
     by_color: bool = False
     """Gone, because what is measured there has other colours."""
+    told: float = 0.0
+    """Share of all of the surface that was there of which frames tell, see `Places.told`."""
 
 
 def chunk_views(chunk: ChunkRow, keyframes: Iterable[Keyframe], unit: float) -> list[DepthView]:

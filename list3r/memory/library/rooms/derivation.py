@@ -192,7 +192,7 @@ def _named_as_before(rooms: Sequence[Room], doorways: Sequence[Doorway], known: 
             ids[room.id] = last
     named = sorted((replace(r, id=ids[r.id]) for r in rooms), key=lambda r: r.id)
     moved = [replace(d, a=min(ids[d.a], ids[d.b]), b=max(ids[d.a], ids[d.b])) for d in doorways]
-    return Rooms(named, moved, last)
+    return Rooms(named, sorted(moved, key=lambda d: (d.a, d.b, d.position.tobytes())), last)
 
 
 def _overlap(a: Room, b: Room) -> float:
