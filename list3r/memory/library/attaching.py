@@ -111,7 +111,7 @@ def _add(scene: Scene, fresh: Mapping[int, tuple[Key, Evidence]]) -> None:
     for n, (key, evidence) in fresh.items():
         row, shapes, group = scene.rows[key[0]], scene.shapes(key[0]), Group((key,))
         of = {key[0]: (shapes, row.S_world_chunk, np.zeros(len(shapes.points), bool))}
-        upright = world.upright and row.component == world.first
+        upright = world.stands(row.component)
         found = derived_instance(n, Members(group, group, of, row.component, upright), scene.settings.derive)
         kind, sure = flagged_only([found.geometry])[0], round(evidence.confidence, 4)
         found = replace(found, geometry=replace(found.geometry, structure=kind, confidence=sure))

@@ -172,7 +172,7 @@ def _instances(scene: Scene, members: Mapping[int, Group], formed: Formed) -> di
         mover = formed.places.movers.get(g[0])
         here = g if mover is not None else formed.changes.current.get(g[0], g)
         component = scene.component(g[0][0])
-        upright = world.upright and component == world.first
+        upright = world.stands(component)
         found = derived_instance(n, Members(g, here, of, component, upright, mover), scene.settings.derive)
         out[n] = replace(found, geometry=replace(found.geometry, confidence=round(formed.weighed[g].confidence, 4)))
     return out

@@ -381,16 +381,19 @@ class CameraTracker:
         nearby: bool,
         frugal: bool = False,
         found: Sequence[FrameRegistration] = (),
+        known: Sequence[int] | None = None,
     ) -> FrameRegistration | None:
         """Find the frame by features, and by starts around the last pose where it is `nearby`.
 
-        `found` are registrations that nothing confirms yet. A `frugal` search takes the first unambiguous place by
-        features. Raises `_SkippedFramesNeededError` where frames before it were skipped.
+        Features are compared with those of frames `known`, else of the last ones. `found` are registrations that
+        nothing confirms yet. A `frugal` search takes the first unambiguous place by features. Raises
+        `_SkippedFramesNeededError` where frames before it were skipped.
         """
         if self._waiting:
             raise _SkippedFramesNeededError
         last = max(segment.T_segment_cam)
-        known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
+        if known is None:
+            known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
         guesses = (self._feature_guess(segment, k, position) for k in known)
         verified = (features for features in guesses if features is not None)
         tried: list[VerifiedFeatures] = []
@@ -455,8 +458,17 @@ class CameraTracker:
         return base + left
 
     def _connect(self, base: TrackedSegment, other: TrackedSegment) -> Pose | None:
-        for position in other.keyframes[:4]:
-            found = self._search(base, position, nearby=False)
+        """Return where another segment lies by a keyframe of it; a long one is searched for in all of the base.
+
+        Past a bare wall the camera looks at what it saw before it turned there, which its last views do not show.
+        """
+        s, seen = self.settings, other.keyframes[:4]
+        wide = len(other.T_segment_cam) >= s.short_segment
+        if wide:
+            seen = other.keyframes[:: max(1, len(other.keyframes) // s.join_keyframes)][: s.join_keyframes]
+        for position in seen:
+            near = [k for _, k in sorted((abs(k - position), k) for k in base.keyframes)][: 3 * s.join_keyframes]
+            found = self._search(base, position, nearby=False, known=near if wide else None)
             if found is not None:
                 self._leave_out(position, found)
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])

@@ -104,6 +104,8 @@ class OdometrySettings:
     """Width of the pictures whose features are compared, px."""
     search_keyframes: int = 6
     """Most keyframes whose features are compared in a search."""
+    join_keyframes: int = 8
+    """Keyframes of a segment by which it is joined to another, each compared with three times as many of that one."""
     sweep_samples: int = 800
     """Model points used by the coarse registrations of a search."""
     start_shift: float = 0.1

@@ -112,7 +112,7 @@ class _Placed:
             for k, n, x in ((k, n, self.shapes[k]) for k, n in group)
         ]
         component = chunks[group[0][0]].component
-        upright = world.upright and component == world.first
+        upright = world.stands(component)
         found = derive_instance(scrap_id, members, component, upright=upright, settings=self._settings.derive)
         whole = float(np.mean([m.shapes.stability[m.at] for m in members]))
         found = replace(found, geometry=replace(found.geometry, confidence=round(whole, 4)))

@@ -55,7 +55,7 @@ def _instance(
     scene: Scene, world: World, instance_id: int, group: Group, members: Sequence[Member], confidence: float
 ) -> Scrap:
     component = scene.component(group[0][0])
-    upright = world.upright and component == world.first
+    upright = world.stands(component)
     found = derive_instance(instance_id, members, component, upright=upright, settings=scene.settings.derive)
     found = replace(found, geometry=replace(found.geometry, confidence=round(confidence, 4)))
     times = scene.times_of({k for k, _ in group})
