@@ -37,7 +37,9 @@ NormalEquations = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 _CELL_PX, _CELL_POINTS = 16, 10
-"""Part of the image in which normals are alike but for noise, and how many tell it."""
+"""Part of the image in which normals may be alike but for noise, and how many tell it."""
+_CALM, _CALM_SHARE = 0.1, 1.4
+"""Quantile of the cells that tells noise, and the mean variance of a bare wall's cells over that quantile of them."""
 
 
 @dataclass(frozen=True)
@@ -313,7 +315,10 @@ def _solid_information(pairs: _SurfelPairs, settings: RegistrationSettings) -> N
 
 
 def _normal_variance(pairs: _SurfelPairs) -> float:
-    """Variance of the model's normals about those around them in the image, along one axis, rad^2: the median cell."""
+    """Noise of the model's normals, the variance about those around them in the image along one axis, rad^2.
+
+    The calmest cells tell it: in others edges and curves add to it, and they are no noise.
+    """
     column, row = np.floor(pairs.uv / _CELL_PX).astype(np.int64).T
     cell = row * (column.max() + 1) + column
     count = np.bincount(cell)
@@ -322,7 +327,7 @@ def _normal_variance(pairs: _SurfelPairs) -> float:
         return 0.0
     total = np.stack([np.bincount(cell, axis)[full] for axis in pairs.normals.T], axis=1)
     n = count[full]
-    return float(np.median((n - (total**2).sum(axis=1) / n) / (2 * (n - 1))))
+    return _CALM_SHARE * float(np.quantile((n - (total**2).sum(axis=1) / n) / (2 * (n - 1)), _CALM))
 
 
 def _photometric(
