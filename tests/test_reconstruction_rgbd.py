@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -202,6 +203,16 @@ def test_noise_of_one_view_does_not_hold_the_camera_before_a_bare_wall() -> None
     frames = [Frame(k, k / 15, f.color, f.depth, None) for k, f in enumerate(seen)]
     with pytest.raises(TrackingError, match="0 to 5"):
         RgbdReconstructor()(frames, CAMERA)
+
+
+def test_a_frame_that_depth_alone_places_says_so(frames: list[Frame], truth: np.ndarray) -> None:
+    rng, blurred = np.random.default_rng(0), cv2.GaussianBlur(frames[6].color, (0, 0), 6).astype(np.float32)
+    shadow = cv2.GaussianBlur(rng.standard_normal(blurred.shape[:2]), (0, 0), 4)
+    color = blurred + 0.5 * blurred.std() / shadow.std() * shadow[..., None]
+    spoiled = replace(frames[6], color=np.clip(color, 0, 255).astype(np.uint8))
+    result = RgbdReconstructor()([*frames[:6], spoiled, *frames[7:12]], CAMERA)
+    assert result.posed.all() and result.unsure == {6}
+    assert pose_errors(result.T_chunk_cam, truth[:12])[0].max() < 0.01
 
 
 def test_noise_is_not_followed() -> None:

@@ -276,6 +276,7 @@ def _result(
         library=library,
         bad_frames=(),
         seconds={},
+        unsure=reconstruction.unsure,
     )
 
 

@@ -91,6 +91,8 @@ class CameraTracker:
         """Positions of frames that were skipped, in runs between two that were not."""
         self.cosines: dict[int, Floats] = {}
         """Cosine of the viewing angle of each frame with depth, by position. Shape (h, w) each."""
+        self.unproven: set[int] = set()
+        """Positions of frames whose pose rests on a given step alone, or on depth or brightness alone."""
         self._prior, self._between = prior, frozenset(between)
         self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
@@ -218,6 +220,7 @@ class CameraTracker:
         """Return the frame's pose in the segment, or None without a reliable one."""
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
+        self.unproven.discard(position)
         found: list[FrameRegistration | None] = []
         given = self._given(segment, last, position, gap_s)
         if given is not None:
@@ -237,6 +240,7 @@ class CameraTracker:
             best = self._without_given(segment, last, position, gap_s)
             possible = [] if best is None else [best]
         if not possible:
+            self.unproven |= {position} if given is not None else set()
             return None if given is None else given.T_model_cam
         best, forget = max(possible, key=_explained), self.settings.forget
         segment.usual_inliers = max(best.inliers, forget * segment.usual_inliers)
@@ -409,7 +413,11 @@ class CameraTracker:
         placed += [self._place(segment, position, T, blind=True) for T in blind]
         proofs = [features for features in (*tried, *left) if features.prove]
         reliable = (p for p in placed if p is not None and (not frugal or self._settled(segment, position, p, proofs)))
-        return max(reliable, key=_explained, default=None)
+        best = max(reliable, key=_explained, default=None)
+        if frugal and best is not None and not proofs:
+            if self._doubtful(segment, best) or not self._tight(best, position):
+                self.unproven.add(position)
+        return best
 
     def _certain(self, segment: TrackedSegment, found: FrameRegistration | None, features: VerifiedFeatures) -> bool:
         if found is None or not features.agree_with(found.T_model_cam):
@@ -425,11 +433,15 @@ class CameraTracker:
         """
         if proofs:
             return any(features.agree_with(found.T_model_cam) for features in proofs)
-        last, far_m = max(segment.T_segment_cam), self.view(position).middle_depth
+        last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
-        tight = found.looseness_m(far_m, surfaces_only=True) <= self.settings.most_looseness_m
-        sure = tight or not self._doubtful(segment, found)
+        sure = self._tight(found, position) or not self._doubtful(segment, found)
         return sure and self._possible(segment, last, found, gap_s)
+
+    def _tight(self, found: FrameRegistration, position: int) -> bool:
+        """Return whether depth alone determines all directions."""
+        loose_m = found.looseness_m(self.view(position).middle_depth, surfaces_only=True)
+        return loose_m <= self.settings.most_looseness_m
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from the usual motions between frames of a slow video."""

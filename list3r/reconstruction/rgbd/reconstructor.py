@@ -103,6 +103,7 @@ class RgbdReconstructor:
                 depth[k] = frame.depth
         faced: Mapping[int, Floats] = {}
         apart: list[list[int]] = []
+        unsure: frozenset[int] = frozenset()
         if self.poses == "given":
             T, posed = given_poses(frames)
             movers = self._find_movers(shown, T[used], posed[used], camera, {})
@@ -114,6 +115,8 @@ class RgbdReconstructor:
                 T, posed, keyframes, tracker = self._estimate(frames, camera, used, known)
                 movers = self._find_movers(shown, T[used], posed[used], camera, _among(tracker.mover_masks, used))
             faced, apart = _among(tracker.cosines, used), self._apart(tracker, posed)
+            tracked = {*tracker.segments[0].T_segment_cam, *(k for run in tracker.passed for k in run)}
+            unsure = frozenset(frames[k].index for k in tracker.unproven | (set(range(len(frames))) - tracked))
         if not posed[used].any():
             raise TrackingError(f"the camera is not found in frames {frames[0].index} to {frames[-1].index}")
         if self.poses == "given" or len(used) < len(frames):
@@ -138,6 +141,7 @@ class RgbdReconstructor:
             keyframes=np.array(keyframes, np.int64),
             movers=movers,
             between=PosedOnly(indices[rest], posed[rest], T[rest]) if len(rest) else None,
+            unsure=unsure,
         )
         return largest, apart
 

@@ -94,8 +94,6 @@ class OdometrySettings:
     foretold_px: float = 2.0
     """A registration this close to its start is the minimum that was foretold: brightness and its slope, smoothed over
     three pixels of the working images, reach no farther. Others are verified by features."""
-    gap_s: float = 0.15
-    """Longest time over which frames are passed over."""
     most_gap_s: float = 1.5
     """Frames further apart than this are searched for by features only."""
     short_segment: int = 5
