@@ -187,7 +187,7 @@ def test_a_memory_says_how_far_its_path_can_be_trusted(tmp_path: Path) -> None:
                 chunk = store.chunks.add(session, replace(made, posed=posed, unsure=frozenset({5, 6, 9, 21})))
                 place = {chunk: Sim3.identity()}
                 store.chunks.place(place, {chunk: 1 + k}, {chunk: np.diag([0.0, 4e-4, 0.0, 0.0, 0.0, 0.0, 0.0])})
-        told = info(store)["path"]
+        told = info(store)["trust"]
     assert told == {
         "lost": [[1, 20, 22]],
         "unsure": [[1, 5, 6], [1, 9, 9]],

@@ -29,7 +29,7 @@ def info(store: Store) -> dict[str, Any]:
         **states,
         "chunks": len(chunks),
         "components": len({c.component for c in chunks}),
-        "path": path_trust(frames, chunks),
+        "trust": path_trust(frames, chunks),
         "loops": sum(e.kind == "loop" and e.accepted for e in edges),
         "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
         "instances": len(store.instances.all(structure=False)),

@@ -46,7 +46,7 @@ def info(
     if json:
         print_answer([{**report, **chunks}], report.pop("units"))
         return
-    for key, value in (report | {"path": path_in_words(report["path"], str(units))}).items():
+    for key, value in (report | {"trust": path_in_words(report["trust"], str(units))}).items():
         if key == "units_per_metre" and value is not None:
             say(f"{'a metre is about':20} {value:g} units, by depths and the height of the cameras (a guess)")
         elif key != "sessions" and (key, value) not in [(name, None) for name in _LEFT_OUT]:

@@ -60,8 +60,8 @@ def _about(memory: SceneMemory) -> dict[str, Any]:
     facts = memory.info()
     kept = ("scale", "gravity", "frames", "posed", "lost", "chunks", "components", "loops", "instances", "structure")
     sessions = [f"session {s['id']}: {s['frames']} frames, {s['state']}" for s in facts["sessions"]]
-    path = path_in_words(facts["path"], memory.units)
-    return {"units": memory.units, "facts": {k: facts[k] for k in kept}, "sessions": sessions, "path": path}
+    trust = path_in_words(facts["trust"], memory.units)
+    return {"units": memory.units, "facts": {k: facts[k] for k in kept}, "sessions": sessions, "trust": trust}
 
 
 def _instance(i: Instance) -> dict[str, Any]:

@@ -435,7 +435,7 @@ class CameraTracker:
             return any(features.agree_with(found.T_model_cam) for features in proofs)
         last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
-        sure = self._tight(found, position) or not self._doubtful(segment, found)
+        sure = self._tight(found, position) or (segment.usual_agreement > 0 and not self._doubtful(segment, found))
         return sure and self._possible(segment, last, found, gap_s)
 
     def _tight(self, found: FrameRegistration, position: int) -> bool:
@@ -472,7 +472,8 @@ class CameraTracker:
     def _connect(self, base: TrackedSegment, other: TrackedSegment) -> Pose | None:
         """Return where another segment lies by a keyframe of it; a long one is searched for in all of the base.
 
-        Past a bare wall the camera looks at what it saw before it turned there, which its last views do not show.
+        Past a bare wall the camera looks at what it saw before it turned there, which its last views do not show. Far
+        from these the planks of a floor look alike, so that depth alone must determine the place of a long one.
         """
         s, seen = self.settings, other.keyframes[:4]
         wide = len(other.T_segment_cam) >= s.short_segment
@@ -481,7 +482,7 @@ class CameraTracker:
         for position in seen:
             near = [k for _, k in sorted((abs(k - position), k) for k in base.keyframes)][: 3 * s.join_keyframes]
             found = self._search(base, position, nearby=False, known=near if wide else None)
-            if found is not None:
+            if found is not None and (not wide or self._tight(found, position)):
                 self._leave_out(position, found)
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
         return None
