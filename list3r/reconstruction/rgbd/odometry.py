@@ -292,8 +292,12 @@ class CameraTracker:
         )
 
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
-        """Return whether depth and brightness agree much less than in the frames before, as in a false minimum."""
-        return found is None or found.inliers * _alike(found) < self.settings.doubt * segment.usual_agreement
+        """Return whether depth and brightness agree much less than in the frames before, as in a false minimum.
+
+        At the beginning of a segment nothing is usual yet: they must agree nearly wholly.
+        """
+        usual = segment.usual_agreement or 1.0
+        return found is None or found.inliers * _alike(found) < self.settings.doubt * usual
 
     def _given(self, segment: TrackedSegment, last: int, position: int, gap_s: float) -> PosePrior | None:
         """The frame's pose by the source's own poses; None where these are missing or the motion is impossible."""
@@ -435,7 +439,7 @@ class CameraTracker:
             return any(features.agree_with(found.T_model_cam) for features in proofs)
         last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
-        sure = self._tight(found, position) or (segment.usual_agreement > 0 and not self._doubtful(segment, found))
+        sure = self._tight(found, position) or not self._doubtful(segment, found)
         return sure and self._possible(segment, last, found, gap_s)
 
     def _tight(self, found: FrameRegistration, position: int) -> bool:
