@@ -337,6 +337,10 @@ def test_parts_of_the_walk_that_could_not_be_joined_stay_apart(tmp_path: Path) -
         assert not [r for r in store.relations.all(predicate="on") if homes[r.subject] == 2], (
             "up is known in the first part only"
         )
+        with store.transaction():
+            store.facts.upright_parts = (2,)
+            consolidate(store)
+        assert [r for r in store.relations.all(predicate="on") if homes[r.subject] == 2]
 
 
 def test_without_gravity_there_are_no_vertical_relations_and_boxes_are_free(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from list3r.frames.source import SourceOptions
 from list3r.memory.core.geometry import umeyama
 from list3r.memory.store.store import Store
 from list3r.pipeline.chunks.chunk import ChunkTask, process_parts
+from list3r.pipeline.session import _pace
 from list3r.pipeline.settings import BuildSettings
 from tests.rgbd_scenes import CAMERA, render
 from tests.test_sfm_build import pose
@@ -68,6 +70,12 @@ def test_a_short_video_a_dark_one_and_large_pictures_keep_more_frames() -> None:
     assert depth_step(Sliding(0.5, dark=900), 100) == 1  # type: ignore[arg-type]
     large = Sliding(0.5, size=(1080, 1920))
     assert depth_step(large, 100) == 1 and depth_step(large, 30) == 2  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fps", [2.0, 30.0])
+def test_the_rate_of_frames_changes_nothing(fps: float) -> None:
+    job = SimpleNamespace(settings=BuildSettings("rgbd", "estimate"), info=SimpleNamespace(fps=fps))
+    assert _pace(job).most == 2  # type: ignore[arg-type]
 
 
 def test_progress_is_told_of_every_place_that_is_looked_at() -> None:

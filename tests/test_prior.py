@@ -74,7 +74,7 @@ def test_frames_that_show_nothing_follow_the_prior(truth: np.ndarray) -> None:
     empty = [replace(f, depth=np.where(f.depth > 0, 1.5, 0).astype(np.float32)) if 4 <= k < 7 else f
              for k, f in enumerate(dark) if f.depth is not None]  # fmt: skip
     made = RgbdReconstructor(poses="prior")(empty, CAMERA)
-    assert made.posed.all()
+    assert made.posed.all() and made.unsure >= {4, 5, 6}
     assert pose_errors(made.T_chunk_cam, truth[:9])[0].max() < 0.05
 
 
@@ -86,7 +86,7 @@ def lightless(frame: Frame) -> Frame:
 def test_frames_without_light_and_depth_follow_the_prior(frames: list[Frame], truth: np.ndarray) -> None:
     seen = [*frames[:3], *map(lightless, frames[3:7]), *frames[7:]]
     made = RgbdReconstructor(poses="prior")(seen, CAMERA)
-    assert made.posed.all()
+    assert made.posed.all() and made.unsure == {3, 4, 5, 6}
     assert pose_errors(made.T_chunk_cam, truth)[0].max() < 0.01
     assert not set(made.keyframes.tolist()) & {3, 4, 5, 6}
     assert RgbdReconstructor(poses="estimate")(seen, CAMERA).posed.tolist() == [not 3 <= k < 7 for k in range(15)]

@@ -6,6 +6,7 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,13 @@ import list3r
 from list3r.api import SceneMemory
 from list3r.exporters.tables import records_of
 from list3r.memory.core.errors import MemoryFileError, OptionError, UnknownIdError
+from list3r.memory.core.geometry import Sim3
 from list3r.memory.store.store import Store
+from list3r.pipeline.settings import BuildSettings
 from list3r.queries.answers import Answers
-from tests.conftest import small_picture, write_small_room
+from list3r.queries.info import info
+from list3r.queries.trust import path_in_words
+from tests.conftest import chunk_result, small_picture, write_small_room
 
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
 
@@ -170,6 +175,29 @@ def test_a_memory_says_what_it_holds(make_memory: Callable[..., Path], tmp_path:
     Store.create(tmp_path / "empty.l3r").close()
     with list3r.open(tmp_path / "empty.l3r") as empty:
         assert empty and len(empty) == 0 and "0 instances" in repr(empty)
+
+
+def test_a_memory_says_how_far_its_path_can_be_trusted(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "a.l3r") as store:
+        with store.transaction():
+            session = store.sessions.add("walk", "abc", BuildSettings().as_plain(), 40)
+            for k in range(2):
+                made = chunk_result(k, 20 * k, 20, ())
+                posed = made.posed & (np.arange(20) >= 3 * k)
+                chunk = store.chunks.add(session, replace(made, posed=posed, unsure=frozenset({5, 6, 9, 21})))
+                place = {chunk: Sim3.identity()}
+                store.chunks.place(place, {chunk: 1 + k}, {chunk: np.diag([0.0, 4e-4, 0.0, 0.0, 0.0, 0.0, 0.0])})
+        told = info(store)["trust"]
+    assert told == {
+        "lost": [[1, 20, 22]],
+        "unsure": [[1, 5, 6], [1, 9, 9]],
+        "breaks": [[1, 23]],
+        "parts": [{"part": 1, "frames": 20, "deviation": 0.02}, {"part": 2, "frames": 17, "deviation": 0.02}],
+    }
+    assert path_in_words(told, "m") == (
+        "places known to 0.02 m; 2 parts of 20, 17 frames; lost in 3 frames (20 to 22); "
+        "little support in 3 frames (5 to 6, 9)"
+    )
 
 
 def test_things_are_had_by_id_and_by_name(memory: SceneMemory) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,8 +20,8 @@ from list3r.reconstruction.rgbd.odometry import CameraTracker
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 from list3r.reconstruction.rgbd.settings import ConfidenceSettings
 from list3r.simulation.dataset import WalkSettings
-from list3r.simulation.rendering.render import Renderer
-from list3r.simulation.rendering.sensor import sense
+from list3r.simulation.rendering.render import RenderedFrame, Renderer
+from list3r.simulation.rendering.sensor import SensorSettings, sense
 from tests.rgbd_scenes import CAMERA, along_a_striped_wall, black, frames_along, pose_errors, render, walk
 
 
@@ -113,6 +114,26 @@ def test_a_cut_to_another_place_leaves_the_larger_part(frames: list[Frame], trut
     assert shift.max() < 0.01
 
 
+def test_each_stretch_between_cuts_is_a_part_in_order_of_time(frames: list[Frame], truth: np.ndarray) -> None:
+    other = frames_along(walk(15), seed=7, boxes=(((-0.5, -0.4, 1.2), (0.1, 0.3, 1.7)),))
+    bare = black(frames[0])
+    cut = [*other[:10], bare, *frames[:25]]
+    cut = [replace(f, index=k, time_s=k / 30) for k, f in enumerate(cut)]
+    first, last = RgbdReconstructor().parts(cut, CAMERA)
+    assert first.frame_indices.tolist() == list(range(10)) and first.posed.all()
+    assert last.frame_indices.tolist() == list(range(10, 36)) and last.posed[1:].all() and not last.posed[0]
+    assert last.frame_indices[last.keyframes[0]] == 11
+    for part, poses in ((first, walk(15)[:10]), (last, truth[:25])):
+        shift, _ = pose_errors(part.T_chunk_cam[part.posed], poses)
+        assert shift.max() < 0.01
+
+
+def test_a_video_without_a_cut_is_one_part(frames: list[Frame]) -> None:
+    (part,) = RgbdReconstructor().parts(frames[:12], CAMERA, deep=range(0, 12, 2))
+    whole = RgbdReconstructor().thinned(frames[:12], CAMERA, range(0, 12, 2))
+    assert np.array_equal(part.T_chunk_cam, whole.T_chunk_cam) and part.between is not None
+
+
 def test_a_slow_video_is_followed() -> None:
     poses = walk(10, speed=15.0)
     result = RgbdReconstructor()(frames_along(poses, step_s=0.5), CAMERA)
@@ -171,6 +192,27 @@ def test_a_bare_wall_does_not_tell_how_the_camera_moves() -> None:
     poses[:, 0, 3] = 0.05 * np.arange(6)
     with pytest.raises(TrackingError, match="0 to 5"):
         RgbdReconstructor()(frames_along(poses, contrast=0.0, boxes=()), CAMERA)
+
+
+def test_noise_of_one_view_does_not_hold_the_camera_before_a_bare_wall() -> None:
+    shape = (CAMERA.height, CAMERA.width)
+    shade = np.linspace(150, 190, CAMERA.width, dtype=np.float32)
+    color = np.tile(shade[None, :, None], (CAMERA.height, 1, 3))
+    wall = RenderedFrame(color, np.full(shape, 0.8, np.float32), np.zeros(shape, np.int32), np.ones(shape, np.float32))
+    seen = [sense(wall, SensorSettings(), 0, k, k / 15) for k in range(6)]
+    frames = [Frame(k, k / 15, f.color, f.depth, None) for k, f in enumerate(seen)]
+    with pytest.raises(TrackingError, match="0 to 5"):
+        RgbdReconstructor()(frames, CAMERA)
+
+
+def test_a_frame_that_depth_alone_places_says_so(frames: list[Frame], truth: np.ndarray) -> None:
+    rng, blurred = np.random.default_rng(0), cv2.GaussianBlur(frames[6].color, (0, 0), 6).astype(np.float32)
+    shadow = cv2.GaussianBlur(rng.standard_normal(blurred.shape[:2]), (0, 0), 4)
+    color = blurred + 0.5 * blurred.std() / shadow.std() * shadow[..., None]
+    spoiled = replace(frames[6], color=np.clip(color, 0, 255).astype(np.uint8))
+    result = RgbdReconstructor()([*frames[:6], spoiled, *frames[7:12]], CAMERA)
+    assert result.posed.all() and result.unsure == {6}
+    assert pose_errors(result.T_chunk_cam, truth[:12])[0].max() < 0.01
 
 
 def test_noise_is_not_followed() -> None:

@@ -197,6 +197,32 @@ def test_up_as_it_was_asked_for(tmp_path: Path, up: str, status: str, z: Array |
             assert lean(store.chunks.all()[0].S_world_chunk.rotation @ Z, z) < 1.0
 
 
+def test_each_part_has_an_up_of_its_own_where_its_surfaces_tell_it(tmp_path: Path) -> None:
+    frames = np.arange(20)
+    lying = rotation_exp(np.array([1.4, 0.5, 0.2]))
+    with Store.create(tmp_path / "a.l3r") as store, store.transaction():
+        store.facts.poses = "estimate"
+        session = store.sessions.add("walk", "abc", BuildSettings().as_plain(), 60)
+        for k, turn in enumerate((np.eye(3), lying, lying)):
+            table = local_instance(0, box_points((2, 0, -0.6), (1.2, 0.8, 0.005), 900, 0) @ turn.T, (9, 9, 9), frames)
+            table = replace(table, plane=np.array([*(turn @ Z), 0.6]))
+            made = chunk_result(k, 20 * k, 20, (table,) if k < 2 else ())
+            T = made.T_chunk_cam.copy()
+            T[:, :3] = turn @ T[:, :3]
+            samples = replace(made.samples, T_chunk_cam=T)
+            store.chunks.add(session, replace(made, T_chunk_cam=T, samples=samples))
+        place_chunks(store)
+        assert [gravity_of(store, k) for k in (1, 2, 3)] == ["estimated", "unknown", "unknown"]
+        place_chunks(store, bend=True)
+        assert [gravity_of(store, k) for k in (1, 2, 3)] == ["estimated", "estimated", "unknown"]
+        first, second, _ = store.chunks.all()
+        assert (
+            lean(first.S_world_chunk.rotation @ Z, Z) < 1.0 and lean(second.S_world_chunk.rotation @ lying @ Z, Z) < 1.0
+        )
+        place_chunks(store, bend=True)
+        assert lean(store.chunks.get(2).S_world_chunk.rotation @ lying @ Z, Z) < 1.0
+
+
 def test_build_takes_a_direction_of_the_first_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     walk = write_walk(tmp_path / "walk", WalkSettings(frames=24, size=(128, 96)))
     memory = tmp_path / "a.l3r"

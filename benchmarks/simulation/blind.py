@@ -40,6 +40,8 @@ class BlindSettings:
     """Fastest rate of the turns to the wall and back."""
     step_m_s: float = 1.5
     """Fastest pace of the way to the wall and back."""
+    onward: int = 0
+    """Frames of the walk that the way back from the wall leaves out, by a free way: it is not where it left."""
     exposure_s: float = 1.0 / 30.0
     """Of each picture in lamp light, over which turns are drawn out."""
     dark_at: float = 0.75
@@ -65,16 +67,16 @@ def blind_walk(walk: WalkSettings, blind: BlindSettings) -> BlindWalk:
     """Return the walk with a detour to a bare wall, and with dark frames. The rest of the way stays as it was."""
     _, poses = walk.poses()
     fps, at = walk.path.fps, round(blind.wall_at * len(poses))
-    here = poses[at]
+    here, on = poses[at], at + blind.onward
     scene = SolidScene(walk.world().objects)
     ends = _bare_wall(walk, scene, here, blind)
     before_wall = _between(*ends, round(blind.wall_s * fps))
-    there, back = (_quick(a, b, fps, blind) for a, b in ((here, ends[0]), (ends[1], here)))
+    there, back = (_quick(a, b, fps, blind) for a, b in ((here, ends[0]), (ends[1], poses[on])))
     detour = np.concatenate([there, before_wall, back])
     names = [TURN] * len(there) + [WALL] * len(before_wall) + [TURN] * len(back)
     dark_from = round(blind.dark_at * len(poses))
-    rest = [DARK if 0 <= k - dark_from < round(blind.dark_s * fps) else WALKED for k in range(at + 1, len(poses))]
-    T = np.concatenate([poses[: at + 1], detour, poses[at + 1 :]])
+    rest = [DARK if 0 <= k - dark_from < round(blind.dark_s * fps) else WALKED for k in range(on + 1, len(poses))]
+    T = np.concatenate([poses[: at + 1], detour, poses[on + 1 :]])
     return BlindWalk(np.arange(len(T)) / fps, T, (*[WALKED] * (at + 1), *names, *rest), blind.exposure_s)
 
 

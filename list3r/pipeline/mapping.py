@@ -31,6 +31,7 @@ from list3r.memory.library.labels import (
     votes_of_probabilities,
 )
 from list3r.memory.store.store import Store
+from list3r.pipeline.chunks.chunk import PART_STEP
 from list3r.pipeline.placing import knows_cameras, place_chunks, poses_given
 from list3r.pipeline.settings import AssociationSettings, session_settings
 
@@ -84,7 +85,7 @@ def _relate(
     if given:
         store.edges.add(_edge_of_given_poses(store, session_id))
     else:
-        adjacent = _adjacent_edge(store, session_id, how, debug_dir)
+        adjacent = _adjacent_edges(store, session_id, how, debug_dir)
         store.edges.add(adjacent)
         given = any(in_one_frame(e) for e in adjacent)
         store.edges.add([] if given else _prior_edge(store, session_id, result, how))
@@ -100,15 +101,22 @@ def _last_two(store: Store, session_id: int) -> list[ChunkRow]:
     return [c for c in store.chunks.all(session_id) if c.chunk_id not in blank][-2:]
 
 
-def _adjacent_edge(store: Store, session_id: int, how: AssociationSettings, debug_dir: Path | None) -> list[Edge]:
-    """The edge to the chunk before, from the frames that both hold; none when too little is shared to measure it.
+def _adjacent_edges(store: Store, session_id: int, how: AssociationSettings, debug_dir: Path | None) -> list[Edge]:
+    """The edges to the chunk before, or to all the parts that it fell into, from the frames that both hold.
 
-    What moved between the two is flagged on the way.
+    None when too little is shared to measure it. What moved between the two is flagged on the way.
     """
-    chunks = _last_two(store, session_id)
-    if len(chunks) < 2:
-        return []
-    u, v = chunks
+    blank = store.chunks.blank()
+    *before, v = (c for c in store.chunks.all(session_id) if c.chunk_id not in blank)
+    span = before[-1].index % PART_STEP if before else 0
+    together = [u for u in before if u.index % PART_STEP == span]
+    return [e for u in together for e in _adjacent_edge(store, u, v, how, debug_dir)]
+
+
+def _adjacent_edge(
+    store: Store, u: ChunkRow, v: ChunkRow, how: AssociationSettings, debug_dir: Path | None
+) -> list[Edge]:
+    session_id = v.session_id
     metric = u.scale_kind == v.scale_kind == "metric"
     samples_u, samples_v = store.chunks.samples(u.chunk_id), store.chunks.samples(v.chunk_id)
     by_cameras = None

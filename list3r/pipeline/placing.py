@@ -86,14 +86,28 @@ def place_chunks(
     if bend and how.guess_metre:
         main = [c for c in rows if c.component == min(graph.components.values())]
         store.facts[GUESS] = guess_metre(store, main, graph.S_graph_chunk, gravity)
-    S_world_graph = write_scale(store, rows, graph.S_graph_chunk) @ upright
+    metre = write_scale(store, rows, graph.S_graph_chunk)
+    S_world_graph = metre @ upright
     store.facts.S_world_graph = S_world_graph
     # To the digits that a deviation has: the last ones of a float64 differ from run to run.
     deviation = None if gravity.deviation_deg is None else round(gravity.deviation_deg, 3)
     store.facts.gravity, store.facts.gravity_deviation_deg = gravity.status, deviation
-    placed = {c.chunk_id: S_world_graph @ graph.S_graph_chunk[c.chunk_id] for c in chunks}
+    stood = _parts_upright(store, graph, apart, metre) if bend else {}
+    store.facts.upright_parts = tuple(stood)
+    placed = {k: stood.get(graph.components[k], S_world_graph) @ graph.S_graph_chunk[k] for k in ids}
     store.chunks.place(placed, graph.components, known)
     _place_blank(store, blank)
+
+
+def _parts_upright(store: Store, graph: GraphResult, apart: Mapping[int, int], metre: Sim3) -> dict[int, Sim3]:
+    """S_world_graph of the parts that are not joined to the first, of those whose own surfaces tell up.
+
+    Each lies anyhow, and how its cameras were held is not enough: a stretch between two bare walls is short.
+    """
+    parts = sorted(set(graph.components.values()))[1:]
+    rule = _rule(store)
+    found = {k: estimate_gravity(store, graph.S_graph_chunk, apart, rule=rule, component=k) for k in parts}
+    return {k: metre @ world_from_graph(up) for k, up in found.items() if up.status == "estimated"}
 
 
 def _place_blank(store: Store, blank: Collection[int]) -> None:
@@ -142,6 +156,7 @@ def _as_stated(judged: Edge, own: Edge) -> Edge:
 
 def _place_fitted(store: Store, graph: GraphResult, covariances: Mapping[int, NDArray[np.float64]]) -> None:
     """Write where the new chunk lies, and those that moved for it, in the world as it stands."""
+    store.facts.upright_parts = ()  # until the end of the session: parts may have become one
     S_world_graph = store.facts.S_world_graph
     layers = graph.S_graph_chunk.maps if isinstance(graph.S_graph_chunk, ChainMap) else [graph.S_graph_chunk]
     moved = sorted({k for layer in layers if isinstance(layer, dict) for k in layer})

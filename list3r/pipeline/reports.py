@@ -9,6 +9,7 @@ from itertools import pairwise
 
 from list3r.association.revisits.session_edges import DEFERRED
 from list3r.memory.core.records import Edge, FrameRow, JsonFields
+from list3r.memory.library.world.gravity import gravity_of
 from list3r.memory.store.store import Store
 from list3r.pipeline.filming import film_advice
 from list3r.pipeline.session import Plan, lost_reasons, settled_notes, shot_cuts
@@ -196,8 +197,9 @@ def _build_notes(store: Store, session: int, lost: int, components: int) -> tupl
     notes += lost_reasons(store, session)
     if components > 1:
         notes.append(f"the video falls into {components} parts that could not be joined; each has its own frame")
-        if store.facts.gravity != "unknown":
-            notes.append("which way is up is known in the first part alone")
+        known = {c.component for c in store.chunks.all() if gravity_of(store, c.component) != "unknown"}
+        if known and len(known) < components:
+            notes.append(f"which way is up is known in {len(known)} of the parts alone")
     if store.facts.gravity == "unknown":
         notes.append("which way is up is unknown; vertical relations (on, above, below) are left out")
     return tuple(notes)

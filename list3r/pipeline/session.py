@@ -334,13 +334,11 @@ def settled_step(store: Store, session: int, job: Job, watch: Watch) -> int:
 
 
 def _pace(job: Job) -> PaceSettings:
-    """How many frames may be passed over: no more than the camera can be followed without, none of which is held."""
+    """How many frames may be passed over, none of which is held."""
     pace = job.settings.pace
     if not entry(job.settings.reconstruction).skips:
         return pace
-    how = job.settings.models.rgbd
-    gap = int(how.odometry.gap_s * job.info.fps)
-    return replace(pace, most=min(pace.most, how.most_step, max(1, gap)), most_mb=float("inf"))
+    return replace(pace, most=min(pace.most, job.settings.models.rgbd.most_step), most_mb=float("inf"))
 
 
 def note_lost(store: Store, session: int, result: ChunkResult) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
+from list3r.queries.trust import path_trust
 
 
 def info(store: Store) -> dict[str, Any]:
@@ -28,6 +29,7 @@ def info(store: Store) -> dict[str, Any]:
         **states,
         "chunks": len(chunks),
         "components": len({c.component for c in chunks}),
+        "trust": path_trust(frames, chunks),
         "loops": sum(e.kind == "loop" and e.accepted for e in edges),
         "loops_rejected": sum(e.kind == "loop" and not e.accepted for e in edges),
         "instances": len(store.instances.all(structure=False)),

@@ -108,6 +108,8 @@ class Reconstruction:
     """Noise of computed depth; None for a sensor's readings, whose noise is known and independent by frame."""
     between: PosedOnly | None = None
     """Further frames of the chunk, disjoint from the above."""
+    unsure: frozenset[int] = frozenset()
+    """`Frame.index` of those whose pose little supports."""
 
     def __post_init__(self) -> None:
         count = len(self.frame_indices)

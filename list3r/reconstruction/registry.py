@@ -48,7 +48,7 @@ class ModelEntry:
     thins: bool = False
     """Needs depth of only some of the frames where all show the same from nearly the same place."""
     skips: bool = False
-    """Can skip frames between those that get depth, and has `thinned(frames, camera, deep)`."""
+    """Can skip frames between those that get depth."""
     maps_videos: bool = False
     """Has `placed(frames, camera, T_map_cam)` for chunks of a video that was mapped as a whole before."""
     by_cameras: bool = False

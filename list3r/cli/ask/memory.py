@@ -47,6 +47,7 @@ def info(
     Example: list3r info house.l3r --loops
     """
     from list3r.cli.ask.loops import loop_report, print_loop_report
+    from list3r.queries.trust import path_in_words
 
     with open_memory(memory) as scene:
         report = scene.info()
@@ -55,7 +56,7 @@ def info(
     if json:
         print_answer([{**report, **chunks}], report.pop("units"))
         return
-    for key, value in report.items():
+    for key, value in (report | {"trust": path_in_words(report["trust"], str(units))}).items():
         if key == "units_per_metre" and value is not None:
             say(f"{'a metre is about':20} {value:g} units, by depths and the height of the cameras (a guess)")
         elif key != "sessions" and (key, value) not in [(name, None) for name in _LEFT_OUT]:

@@ -16,6 +16,7 @@ import numpy as np
 from list3r.exporters.output import replacing
 from list3r.exporters.pages import embedded, numbers, thumbnails
 from list3r.memory.core.description.printable import shown
+from list3r.queries.trust import path_in_words
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
@@ -59,7 +60,8 @@ def _about(memory: SceneMemory) -> dict[str, Any]:
     facts = memory.info()
     kept = ("scale", "gravity", "frames", "posed", "lost", "chunks", "components", "loops", "instances", "structure")
     sessions = [f"session {s['id']}: {s['frames']} frames, {s['state']}" for s in facts["sessions"]]
-    return {"units": memory.units, "facts": {k: facts[k] for k in kept}, "sessions": sessions}
+    trust = path_in_words(facts["trust"], memory.units)
+    return {"units": memory.units, "facts": {k: facts[k] for k in kept}, "sessions": sessions, "trust": trust}
 
 
 def _instance(i: Instance) -> dict[str, Any]:

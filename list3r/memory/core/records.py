@@ -224,6 +224,8 @@ class ChunkResult:
     """CPU seconds by stage."""
     lost_reason: str = ""
     """Why the camera could not be followed through any of the frames, one sentence; empty where it could."""
+    unsure: frozenset[int] = frozenset()
+    """Frame.index of frames whose pose little supports."""
 
 
 # ---------------------------------------------------------------------------------------------- the memory
@@ -316,6 +318,9 @@ class Edge:
         return "things_pairs" in self.scores
 
 
+UNSURE = "little supports the pose"
+
+
 @dataclass(frozen=True)
 class FrameRow:
     """One frame of the trajectory."""
@@ -330,7 +335,7 @@ class FrameRow:
     T_chunk_cam: Pose
     """Shape (4, 4), NaN unless posed."""
     note: str = ""
-    """Why it could not be decoded."""
+    """Why it could not be decoded; of a posed one `UNSURE` where little supports the pose."""
 
 
 @dataclass(frozen=True)

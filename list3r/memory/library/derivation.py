@@ -173,7 +173,7 @@ def _instances(scene: Scene, members: Mapping[int, Group], formed: Formed) -> di
         mover = formed.places.movers.get(g[0])
         here = g if mover is not None else formed.changes.current.get(g[0], g)
         component = scene.component(g[0][0])
-        upright = world.upright and component == world.first
+        upright = world.stands(component)
         derived = partial(derived_instance, n, chunks=of, component=component, upright=upright, settings=settings)
         found = derived(here)
         if mover is not None:

@@ -56,7 +56,7 @@ def with_structure(
 
 def _kind(scene: Scene, geometry: InstanceGeometry, around: Neighbourhood, members: Group) -> str | None:
     world, s = scene.world, scene.settings.structure
-    if not (world.upright and geometry.component == world.first) or geometry.normal is None:
+    if not world.stands(geometry.component) or geometry.normal is None:
         return flagged_only([geometry])[0]
     reach = np.full(3, (s.near_m + _SLACK_M) * world.unit)
     still = [b for b in around.near(geometry.aabb, reach) if b.component == geometry.component]
@@ -85,7 +85,7 @@ def relate(scene: Scene, instances: Iterable[DerivedInstance]) -> list[Relation]
         there = _within_rings(known, subjects, reach)
         for component in sorted({b.component for b in there}):
             inside = [b for b in there if b.component == component]
-            vertical = scene.world.upright and component == scene.world.first
+            vertical = scene.world.stands(component)
             sure = scene.world.sure_of_up
             found = relations(inside, gravity_known=vertical, unit=unit, settings=s, measured=measured, sure_of_up=sure)
             told = (r for r in found if r.subject in subjects or r.object in subjects)

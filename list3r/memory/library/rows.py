@@ -73,7 +73,7 @@ def record_alone(
     """
     store, world, component = scene.store, scene.world, scene.component(group[0][0])
     of = {k: (shapes[k], scene.pose(k), np.zeros(len(shapes[k].points), bool)) for k, _ in group}
-    upright = world.upright and component == world.first
+    upright = world.stands(component)
     settings = scene.settings.derive
     found = derived_instance(instance_id, group, of, component, upright=upright, settings=settings)
     kind = flagged_only([found.geometry])[0] if bounds else None

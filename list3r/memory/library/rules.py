@@ -116,6 +116,12 @@ class World:
     """What relations that need up are as sure as at most."""
     guessed: bool = False
     """Whether lengths are guessed metres."""
+    upright_parts: tuple[int, ...] = ()
+    """Other components in which z is up."""
+
+    def stands(self, component: int) -> bool:
+        """Return whether z is up in a component."""
+        return (self.upright and component == self.first) or component in self.upright_parts
 
 
 WORLD = Fact[World | None]("library", World, None)
@@ -142,6 +148,7 @@ def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s:
         space=spaces.pop() if len(spaces) == 1 else "",
         sure_of_up=sure_of_up(store),
         guessed=store.facts.scale_kind == "guessed",
+        upright_parts=store.facts.upright_parts,
     )
 
 

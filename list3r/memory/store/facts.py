@@ -55,7 +55,9 @@ class Facts:
     """Metres in a unit of the pose graph; None where it is one unit of the world."""
     gravity = Fact[str]("gravity", str, "unknown")
     """known, estimated by surfaces, assumed by how the camera was held (z is up in all three), or unknown. It holds for
-    the first part of a memory alone."""
+    the first part of a memory; of the others see `upright_parts`."""
+    upright_parts = Fact[tuple[int, ...]]("upright_parts", tuple[int, ...], ())
+    """Components but the first in which z is up too, by their own surfaces."""
     gravity_deviation_deg = Fact[float | None]("gravity_deviation_deg", float, None)
     """Of z from up; None where a recorder knew it or nobody does."""
     gravity_estimate = Fact[UpEstimate | None]("gravity_estimate", UpEstimate, None)

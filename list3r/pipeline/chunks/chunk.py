@@ -130,7 +130,8 @@ def reconstruct(
     except BaselineError as error:
         failed = error
     alone = len(_posed(parts))
-    if task.shot is not None and (failed or (hasattr(model, "parts") and 2 * alone < len(frames))):
+    borrows = hasattr(model, "parts") and not entry(task.settings.reconstruction).needs_depth
+    if task.shot is not None and (failed or (borrows and 2 * alone < len(frames))):
         more = borrow(source, (task.span.start, task.span.stop), task.shot, frames, task.settings.borrowing)
         if failed or 2 * more.followed > len(frames):
             found = _borrowed_parts(task, model, more, camera, deep)
@@ -160,9 +161,7 @@ def _parts(
     model: Reconstructor, frames: Sequence[Frame], camera: Camera, around: Around | None, deep: Collection[int] | None
 ) -> Sequence[Reconstruction]:
     """All parts that hang together, from models that tell them apart; otherwise one. Raises `TrackingError`."""
-    parts, thinned = getattr(model, "parts", None), getattr(model, "thinned", None)
-    if deep is not None and thinned is not None:
-        return [thinned(frames, camera, deep)]
+    parts = getattr(model, "parts", None)
     return [model(frames, camera)] if parts is None else parts(frames, camera, around, deep)
 
 
@@ -276,6 +275,7 @@ def _result(
         library=library,
         bad_frames=(),
         seconds={},
+        unsure=reconstruction.unsure,
     )
 
 

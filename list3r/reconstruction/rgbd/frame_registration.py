@@ -36,6 +36,12 @@ NormalEquations = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Information, shape (6, 6), and gradient, shape (6,), of the left-hand tangent (translation, rotation)."""
 
 
+_CELL_PX, _CELL_POINTS = 16, 10
+"""Part of the image in which normals may be alike but for noise, and how many tell it."""
+_CALM, _CALM_SHARE = 0.1, 1.4
+"""Quantile of the cells that tells noise, and the mean variance of a bare wall's cells over that quantile of them."""
+
+
 @dataclass(frozen=True)
 class Samples:
     """Surface points of a model."""
@@ -297,15 +303,31 @@ def _solid_information(pairs: _SurfelPairs, settings: RegistrationSettings) -> N
     """Information of depth without the share that comes from noise alone.
 
     A point-to-plane slope is A n with A = (I, [q]x). Noise of variance s in n adds s A A' on average, by which a bare
-    wall would seem to constrain the camera; it is subtracted.
+    wall would seem to constrain the camera; it is subtracted. A model of one view has much more of it than another.
     """
     weight = (pairs.inverse_sigma / np.float32(pairs.scale)) ** 2
     weighted = weight[:, None] * pairs.moved
     first, second = skew(weighted.sum(axis=0).astype(np.float64)), (weighted.T @ pairs.moved).astype(np.float64)
     feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
     information = _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, settings.huber)[0]
-    information -= settings.normal_noise**2 * feigned
+    information -= max(settings.normal_noise**2, _normal_variance(pairs)) * feigned
     return information
+
+
+def _normal_variance(pairs: _SurfelPairs) -> float:
+    """Noise of the model's normals, the variance about those around them in the image along one axis, rad^2.
+
+    The calmest cells tell it: in others edges and curves add to it, and they are no noise.
+    """
+    column, row = np.floor(pairs.uv / _CELL_PX).astype(np.int64).T
+    cell = row * (column.max() + 1) + column
+    count = np.bincount(cell)
+    full = count >= _CELL_POINTS
+    if not full.any():
+        return 0.0
+    total = np.stack([np.bincount(cell, axis)[full] for axis in pairs.normals.T], axis=1)
+    n = count[full]
+    return _CALM_SHARE * float(np.quantile((n - (total**2).sum(axis=1) / n) / (2 * (n - 1)), _CALM))
 
 
 def _photometric(

@@ -90,6 +90,8 @@ class CameraTracker:
         """Positions of frames that were skipped, in runs between two that were not."""
         self.cosines: dict[int, Floats] = {}
         """Cosine of the viewing angle of each frame with depth, by position. Shape (h, w) each."""
+        self.unproven: set[int] = set()
+        """Positions of frames whose pose rests on a given step alone, or on depth or brightness alone."""
         self._prior, self._between = prior, frozenset(between)
         self._waiting: list[int] = []
         self._features: dict[int, Features] = {}
@@ -217,6 +219,7 @@ class CameraTracker:
         """Return the frame's pose in the segment, or None without a reliable one."""
         last = max(segment.T_segment_cam)
         gap_s = max(self.frames[position].time_s - self.frames[last].time_s, 1e-3)
+        self.unproven.discard(position)
         found: list[FrameRegistration | None] = []
         given = self._given(segment, last, position, gap_s)
         if given is not None:
@@ -236,6 +239,7 @@ class CameraTracker:
             best = self._without_given(segment, last, position, gap_s)
             possible = [] if best is None else [best]
         if not possible:
+            self.unproven |= {position} if given is not None else set()
             return None if given is None else given.T_model_cam
         best, forget = max(possible, key=_explained), self.settings.forget
         segment.usual_inliers = max(best.inliers, forget * segment.usual_inliers)
@@ -287,8 +291,12 @@ class CameraTracker:
         )
 
     def _doubtful(self, segment: TrackedSegment, found: FrameRegistration | None) -> bool:
-        """Return whether depth and brightness agree much less than in the frames before, as in a false minimum."""
-        return found is None or found.inliers * _alike(found) < self.settings.doubt * segment.usual_agreement
+        """Return whether depth and brightness agree much less than in the frames before, as in a false minimum.
+
+        At the beginning of a segment nothing is usual yet: they must agree nearly wholly.
+        """
+        usual = segment.usual_agreement or 1.0
+        return found is None or found.inliers * _alike(found) < self.settings.doubt * usual
 
     def _given(self, segment: TrackedSegment, last: int, position: int, gap_s: float) -> PosePrior | None:
         """The frame's pose by the source's own poses; None where these are missing or the motion is impossible."""
@@ -380,16 +388,19 @@ class CameraTracker:
         nearby: bool,
         frugal: bool = False,
         found: Sequence[FrameRegistration] = (),
+        known: Sequence[int] | None = None,
     ) -> FrameRegistration | None:
         """Find the frame by features, and by starts around the last pose where it is `nearby`.
 
-        `found` are registrations that nothing confirms yet. A `frugal` search takes the first unambiguous place by
-        features. Raises `_SkippedFramesNeededError` where frames before it were skipped.
+        Features are compared with those of frames `known`, else of the last ones. `found` are registrations that
+        nothing confirms yet. A `frugal` search takes the first unambiguous place by features. Raises
+        `_SkippedFramesNeededError` where frames before it were skipped.
         """
         if self._waiting:
             raise _SkippedFramesNeededError
         last = max(segment.T_segment_cam)
-        known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
+        if known is None:
+            known = [last, *[k for k in reversed(segment.keyframes) if k != last]][: self.settings.search_keyframes]
         guesses = (self._feature_guess(segment, k, position) for k in known)
         verified = (features for features in guesses if features is not None)
         tried: list[VerifiedFeatures] = []
@@ -405,7 +416,11 @@ class CameraTracker:
         placed += [self._place(segment, position, T, blind=True) for T in blind]
         proofs = [features for features in (*tried, *left) if features.prove]
         reliable = (p for p in placed if p is not None and (not frugal or self._settled(segment, position, p, proofs)))
-        return max(reliable, key=_explained, default=None)
+        best = max(reliable, key=_explained, default=None)
+        if frugal and best is not None and not proofs:
+            if self._doubtful(segment, best) or not self._tight(best, position):
+                self.unproven.add(position)
+        return best
 
     def _certain(self, segment: TrackedSegment, found: FrameRegistration | None, features: VerifiedFeatures) -> bool:
         if found is None or not features.agree_with(found.T_model_cam):
@@ -421,11 +436,15 @@ class CameraTracker:
         """
         if proofs:
             return any(features.agree_with(found.T_model_cam) for features in proofs)
-        last, far_m = max(segment.T_segment_cam), self.view(position).middle_depth
+        last = max(segment.T_segment_cam)
         gap_s = self.frames[position].time_s - self.frames[last].time_s
-        tight = found.looseness_m(far_m, surfaces_only=True) <= self.settings.most_looseness_m
-        sure = tight or not self._doubtful(segment, found)
+        sure = self._tight(found, position) or not self._doubtful(segment, found)
         return sure and self._possible(segment, last, found, gap_s)
+
+    def _tight(self, found: FrameRegistration, position: int) -> bool:
+        """Return whether depth alone determines all directions."""
+        loose_m = found.looseness_m(self.view(position).middle_depth, surfaces_only=True)
+        return loose_m <= self.settings.most_looseness_m
 
     def _sweep(self, segment: TrackedSegment, last: int, position: int) -> list[Pose]:
         """The best of several coarse registrations, started from the usual motions between frames of a slow video."""
@@ -454,9 +473,19 @@ class CameraTracker:
         return base + left
 
     def _connect(self, base: TrackedSegment, other: TrackedSegment) -> Pose | None:
-        for position in other.keyframes[:4]:
-            found = self._search(base, position, nearby=False)
-            if found is not None:
+        """Return where another segment lies by a keyframe of it; a long one is searched for in all of the base.
+
+        Past a bare wall the camera looks at what it saw before it turned there, which its last views do not show. Far
+        from these the planks of a floor look alike, so that depth alone must determine the place of a long one.
+        """
+        s, seen = self.settings, other.keyframes[:4]
+        wide = len(other.T_segment_cam) >= s.short_segment
+        if wide:
+            seen = other.keyframes[:: max(1, len(other.keyframes) // s.join_keyframes)][: s.join_keyframes]
+        for position in seen:
+            near = [k for _, k in sorted((abs(k - position), k) for k in base.keyframes)][: 3 * s.join_keyframes]
+            found = self._search(base, position, nearby=False, known=near if wide else None)
+            if found is not None and (not wide or self._tight(found, position)):
                 self._leave_out(position, found)
                 return found.T_model_cam @ np.linalg.inv(other.T_segment_cam[position])
         return None

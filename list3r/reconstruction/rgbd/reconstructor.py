@@ -7,7 +7,7 @@ together (`odometry`, `frame_registration`, `surfels`); local features find fram
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import cv2
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
 from list3r.memory.core.errors import OptionError, TrackingError
-from list3r.reconstruction.base import PosedOnly, Reconstruction
+from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
 from list3r.reconstruction.motion.free_space import SmallFrames, movers_in_free_space
 from list3r.reconstruction.motion.tracks import track_movers
 from list3r.reconstruction.pose_prior import bridged, source_from_chunk, stacked
@@ -64,6 +64,35 @@ class RgbdReconstructor:
 
         The others are used only where the camera is lost without them. Raises as above.
         """
+        return self._largest(frames, camera, deep)[0]
+
+    def parts(
+        self,
+        frames: Sequence[Frame],
+        camera: Camera,
+        around: Around | None = None,
+        deep: Collection[int] | None = None,
+    ) -> list[Reconstruction]:
+        """All stretches that could be tracked, each by itself, in order of time; frames of none are the largest's.
+
+        A chunk falls into several where nothing holds the camera for a while, as before a bare wall. `deep` as in
+        `thinned`. Raises as above.
+        """
+        all_deep = {frame.index for frame in frames} if deep is None else deep
+        largest, apart = self._largest(frames, camera, all_deep)
+        others: list[Reconstruction] = []
+        for stretch in apart:
+            try:
+                others += self.parts([frames[k] for k in stretch], camera, None, all_deep)
+            except TrackingError:
+                continue
+        elsewhere = {index for part in others for index in _numbers(part)}
+        return sorted([_without(largest, elsewhere), *others], key=lambda part: max(_numbers(part)))
+
+    def _largest(
+        self, frames: Sequence[Frame], camera: Camera, deep: Collection[int]
+    ) -> tuple[Reconstruction, list[list[int]]]:
+        """Reconstruct the longest stretch of a chunk that could be tracked; also the positions of the others."""
         used = [k for k, frame in enumerate(frames) if frame.index in deep]
         shown = [frames[k] for k in used]
         if not any(frame.depth is not None for frame in shown):
@@ -73,6 +102,8 @@ class RgbdReconstructor:
             if frame.depth is not None:
                 depth[k] = frame.depth
         faced: Mapping[int, Floats] = {}
+        apart: list[list[int]] = []
+        unsure: frozenset[int] = frozenset()
         if self.poses == "given":
             T, posed = given_poses(frames)
             movers = self._find_movers(shown, T[used], posed[used], camera, {})
@@ -83,7 +114,9 @@ class RgbdReconstructor:
                 known = {used[k]: _rim(m > 0) for k, m in enumerate(movers) if m.any()}
                 T, posed, keyframes, tracker = self._estimate(frames, camera, used, known)
                 movers = self._find_movers(shown, T[used], posed[used], camera, _among(tracker.mover_masks, used))
-            faced = _among(tracker.cosines, used)
+            faced, apart = _among(tracker.cosines, used), self._apart(tracker, posed)
+            tracked = {*tracker.segments[0].T_segment_cam, *(k for run in tracker.passed for k in run)}
+            unsure = frozenset(frames[k].index for k in tracker.unproven | (set(range(len(frames))) - tracked))
         if not posed[used].any():
             raise TrackingError(f"the camera is not found in frames {frames[0].index} to {frames[-1].index}")
         if self.poses == "given" or len(used) < len(frames):
@@ -97,7 +130,7 @@ class RgbdReconstructor:
             confidence[k] = depth_confidence(image, camera, self.settings.confidence, faced.get(k))
         indices = np.array([frame.index for frame in frames], np.int64)
         rest = np.setdiff1d(np.arange(len(frames)), used)
-        return Reconstruction(
+        largest = Reconstruction(
             frame_indices=indices[used],
             posed=posed[used],
             T_chunk_cam=T[used],
@@ -108,7 +141,20 @@ class RgbdReconstructor:
             keyframes=np.array(keyframes, np.int64),
             movers=movers,
             between=PosedOnly(indices[rest], posed[rest], T[rest]) if len(rest) else None,
+            unsure=unsure,
         )
+        return largest, apart
+
+    def _apart(self, tracker: CameraTracker, posed: NDArray[np.bool_]) -> list[list[int]]:
+        """Positions of the frames of each stretch that stayed apart, with those that were skipped within it."""
+        out = []
+        for segment in tracker.segments:
+            own = set(segment.T_segment_cam)
+            own |= {k for run in tracker.passed if {run[0] - 1, run[-1] + 1} <= own for k in run}
+            own -= set(np.flatnonzero(posed).tolist())
+            if len(own) >= self.settings.odometry.short_segment:
+                out.append(sorted(own))
+        return out
 
     def _find_movers(
         self,
@@ -182,6 +228,35 @@ def _pose_passed(
 def _among(rows: Mapping[int, T_], used: Sequence[int]) -> dict[int, T_]:
     """Values of the `used` frames, renumbered from their position to their rank among them."""
     return {place: rows[k] for place, k in enumerate(used) if k in rows}
+
+
+def _numbers(part: Reconstruction) -> list[int]:
+    """`Frame.index` of all frames of a part."""
+    between = [] if part.between is None else part.between.frame_indices.tolist()
+    return [*part.frame_indices.tolist(), *between]
+
+
+def _without(part: Reconstruction, elsewhere: Collection[int]) -> Reconstruction:
+    """The part without frames, none of them posed, of the numbers `elsewhere`."""
+    if not elsewhere:
+        return part
+    numbers = np.array(sorted(elsewhere), np.int64)
+    keep = ~np.isin(part.frame_indices, numbers)
+    between = part.between
+    if between is not None:
+        here = ~np.isin(between.frame_indices, numbers)
+        between = PosedOnly(between.frame_indices[here], between.posed[here], between.T_chunk_cam[here])
+    return replace(
+        part,
+        frame_indices=part.frame_indices[keep],
+        posed=part.posed[keep],
+        T_chunk_cam=part.T_chunk_cam[keep],
+        depth=part.depth[keep],
+        confidence=part.confidence[keep],
+        keyframes=np.searchsorted(np.flatnonzero(keep), part.keyframes),
+        movers=None if part.movers is None else part.movers[keep],
+        between=between if between is not None and len(between.frame_indices) else None,
+    )
 
 
 def _rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -94,8 +94,6 @@ class OdometrySettings:
     foretold_px: float = 2.0
     """A registration this close to its start is the minimum that was foretold: brightness and its slope, smoothed over
     three pixels of the working images, reach no farther. Others are verified by features."""
-    gap_s: float = 0.15
-    """Longest time over which frames are passed over."""
     most_gap_s: float = 1.5
     """Frames further apart than this are searched for by features only."""
     short_segment: int = 5
@@ -104,6 +102,8 @@ class OdometrySettings:
     """Width of the pictures whose features are compared, px."""
     search_keyframes: int = 6
     """Most keyframes whose features are compared in a search."""
+    join_keyframes: int = 8
+    """Keyframes of a segment by which it is joined to another, each compared with three times as many of that one."""
     sweep_samples: int = 800
     """Model points used by the coarse registrations of a search."""
     start_shift: float = 0.1

@@ -48,7 +48,10 @@ class SurfelModel:
         return Samples(points, normals, gray)
 
     def fuse(self, view: WorkingFrame, T_model_cam: NDArray[np.float64]) -> None:
-        """Average the view into the elements that it agrees with, add new ones, weaken those that it sees through."""
+        """Average the view into the elements that it agrees with, add new ones, weaken those that it sees through.
+
+        Its brightness is brought to the exposure of the model first.
+        """
         pixel = np.flatnonzero(view.valid)
         R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
         local = view.points.reshape(-1, 3)[pixel]
@@ -57,6 +60,9 @@ class SurfelModel:
         rows[:, :3], rows[:, 3:6] = local @ R.T + t, view.normals.reshape(-1, 3)[pixel] @ R.T
         rows[:, 6], rows[:, 7] = view.gray.ravel()[pixel], (np.float32(self._noise.constant_m) / sigma) ** 2
         element = self.visible(T_model_cam, view.camera)[pixel]
+        met = element >= 0
+        if met.any():
+            rows[:, 6] -= np.median(rows[met, 6] - self.elements[element[met], 6])
         seen = rows, np.ascontiguousarray(local[:, 2]), sigma
         limits = self._settings.normal_agreement, self._settings.weight_cap
         new, through = fuse(self.elements, element, seen, np.ascontiguousarray(T_model_cam[:3, 2]), limits)

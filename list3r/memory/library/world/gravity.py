@@ -294,9 +294,10 @@ def estimate_gravity(
     *,
     stated_up: Array | None = None,
     rule: str = "planes",
+    component: int | None = None,
 ) -> Gravity:
     """Return up in the frame in which chunks lie by `S_graph_chunk` (the default: as they are placed), from the chunks
-    of the first component (see `ChunkRow.component`), or 64 of them in a long memory.
+    of the first component (see `ChunkRow.component`) or of another `component`, or 64 of them in a long memory.
 
     Call it inside a transaction; `world_from_graph` then gives what stands the chunks upright. An estimate that still
     agrees with the one before within `hysteresis_deg` gives way to that one, so that the world does not tremble with
@@ -310,7 +311,8 @@ def estimate_gravity(
         components = {c.chunk_id: c.component for c in chunks}
     if not chunks:
         return Gravity("unknown", np.array([0.0, 0.0, 1.0]), None, "the memory is empty")
-    component = min(components[k] for k in S_graph_chunk)
+    first = min(components[k] for k in S_graph_chunk)
+    component = first if component is None else component
     summaries = chunk_summaries(store)
     rows = sample_of([c for c in chunks if components[c.chunk_id] == component])
     inside = [replace(c, component=component, S_world_chunk=S_graph_chunk[c.chunk_id]) for c in rows]
@@ -325,6 +327,8 @@ def estimate_gravity(
         return Gravity("unknown", np.array([0.0, 0.0, 1.0]), None, "it was asked to be left unknown")
     else:
         found = gravity_from_planes(planes, cameras, unit, s, by_planes=rule != "camera")
+    if component != first:
+        return found
     settled = _with_hysteresis(found, store.facts.gravity_estimate, unit, s)
     if settled is found and found.status != "unknown":
         store.facts.gravity_estimate = UpEstimate(found.up, found.floor_height)
@@ -353,9 +357,11 @@ def _with_hysteresis(found: Gravity, before: UpEstimate | None, unit: float, s: 
 
 
 def gravity_of(store: Store, component: int) -> str:
-    """Return what is known of up in a part of the memory: z is up in the first alone, the others lie anyhow."""
+    """Return what is known of up in a part of the memory: where it is unknown the part lies anyhow."""
     first = min((c.component for c in store.chunks.all()), default=component)
-    return store.facts.gravity if component == first else "unknown"
+    if component == first:
+        return store.facts.gravity
+    return "estimated" if component in store.facts.upright_parts else "unknown"
 
 
 def sure_of_up(store: Store) -> float:

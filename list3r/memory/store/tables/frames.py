@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.core.errors import MemoryFileError
-from list3r.memory.core.records import ChunkResult, ChunkRow, FrameRow, Keyframe
+from list3r.memory.core.records import UNSURE, ChunkResult, ChunkRow, FrameRow, Keyframe
 from list3r.memory.store.connection import Connection
 from list3r.memory.store.rows.codec import pack, unpack
 from list3r.memory.store.rows.columns import Columns, joined, nested
@@ -67,7 +67,8 @@ class Frames:
                 continue
             time_s = 0.0 if np.isnan(result.times_s[k]) else float(result.times_s[k])
             pose = result.T_chunk_cam[k] if posed else _NOWHERE
-            rows.append(FrameRow(session_id, index, time_s, chunk_id, "posed" if posed else "lost", pose))
+            note = UNSURE if posed and index in result.unsure else ""
+            rows.append(FrameRow(session_id, index, time_s, chunk_id, "posed" if posed else "lost", pose, note))
         for index, reason in result.bad_frames:
             if index not in known:
                 rows.append(FrameRow(session_id, index, 0.0, chunk_id, "bad", _NOWHERE, reason))
