@@ -36,7 +36,7 @@ T = TypeVar("T")
 FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
 READING = {
     *("overview", "find", "nearest", "within", "relations", "between", "measure", "describe", "picture"),
-    *("changes", "path_of"),
+    *("changes", "path_of", "rooms"),
 }
 WRITING = {"label", "merge", "split", "delete", "undo"}
 TOKEN = "a token for these tests only"
@@ -177,6 +177,7 @@ BAD: dict[str, tuple[dict[str, Any], ...]] = {
     "label": ({"id": 99, "text": "cup"}, {"id": MUG, "text": " "}),
     "undo": ({"entry": 99}, {}),
     "overview": ({},),
+    "rooms": ({},),
 }
 
 
@@ -239,6 +240,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "picture": {"id": MUG},
     "changes": {},
     "path_of": {"id": MUG},
+    "rooms": {},
 }
 EDITS: list[tuple[str, dict[str, Any]]] = [
     ("label", {"id": MUG, "text": "cup"}),
