@@ -243,8 +243,6 @@ class Places:
         """Return the share of the surface that an instance had which is seen through or lies at what is new there, of
         what is told.
         """
-        from scipy.spatial import cKDTree
-
         points = self.points(n, session, before=True)
         free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
         known = free + met > 0
