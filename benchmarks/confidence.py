@@ -44,9 +44,10 @@ from list3r.memory.library.consolidation import consolidate
 from list3r.memory.library.derivation import form
 from list3r.memory.library.evidence import EvidenceSettings
 from list3r.memory.library.overlap.summaries import chunk_summaries
-from list3r.memory.library.rules import WORLD, ConsolidationSettings, settings_of
+from list3r.memory.library.rules import ConsolidationSettings, settings_of
 from list3r.memory.library.scene import Scene
 from list3r.memory.library.uncertainty import OF_COMPUTED_DEPTH, ConfidenceWeights, Signs
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.store import Store
 from list3r.pipeline.settings import BuildSettings
 from list3r.simulation.dataset import WalkSettings, write_walk

@@ -14,7 +14,8 @@ from list3r.memory.core.records import ChunkResult, FrameSamples, LocalInstance,
 from list3r.memory.library.consolidation import ConsolidationReport, consolidate
 from list3r.memory.library.identities import assign_ids
 from list3r.memory.library.relations.settings import RelationSettings
-from list3r.memory.library.rules import WORLD, ConsolidationSettings, settings_of
+from list3r.memory.library.rules import ConsolidationSettings, settings_of
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.search.graphs import merge_graph, relation_graph
 from list3r.memory.store.store import Store
 from tests.conftest import chunk_result, local_instance

@@ -19,7 +19,8 @@ from list3r.memory.library.labels import apply_labels, put_votes
 from list3r.memory.library.maintenance import edits
 from list3r.memory.library.overlap import summaries, voxels
 from list3r.memory.library.overlap.summaries import is_known, world_unit
-from list3r.memory.library.rules import WORLD, ConsolidationSettings, RedundancySettings
+from list3r.memory.library.rules import ConsolidationSettings, RedundancySettings
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.store import Store
 
 ORDERS = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from list3r.memory.library.world.scale import lengths_of
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.store import Store
 from list3r.queries.trust import path_trust
 
@@ -52,8 +53,6 @@ def _guessed_metre(store: Store) -> float | None:
     """Return about how many units a metre is in a memory of relative scale, by depths and the height of the cameras."""
     if store.facts.scale_kind != "relative":
         return None
-    from list3r.memory.library.rules import WORLD
-
     world = store.facts[WORLD]
     return None if world is None else round(world.unit, 3)
 

@@ -11,6 +11,7 @@ from list3r.memory.core.errors import OptionError, check_choice, check_share
 from list3r.memory.core.records import Instance, Relation
 from list3r.memory.library.relations.predicates import INVERSE, PREDICATES
 from list3r.memory.library.relations.settings import RelationSettings
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.store import Store
 from list3r.queries.answers import Rows
 from list3r.queries.finding.words import is_named, no_such_words, same_kind, wanted_words
@@ -225,11 +226,8 @@ def _between(store: Store, subjects: list[int] | None, ones: list[int] | None, o
 
 
 def _near_line(store: Store, a: Instance, b: Instance, asked: list[Instance]) -> list[Instance]:
-    near = set(store.instances.ids_in_box(np.minimum(a.aabb[0], b.aabb[0]), np.maximum(a.aabb[1], b.aabb[1]))) - {
-        a.id,
-        b.id,
-    }
-    return [i for i in asked if i.id in near]
+    near = store.instances.ids_in_box(np.minimum(a.aabb[0], b.aabb[0]), np.maximum(a.aabb[1], b.aabb[1]))
+    return [i for i in asked if i.id in {*near} - {a.id, b.id}]
 
 
 def noise_of(store: Store) -> float:
@@ -238,15 +236,8 @@ def noise_of(store: Store) -> float:
 
 
 def unit_of(store: Store) -> float:
-    """Return what a metre is in world units: 1 if the memory is metric, else an estimate from the distances of things
-    from the cameras, which stand about two metres from what they look at indoors.
-    """
+    """Return what a metre is in world units: 1 if the memory is metric, else as stored relations were derived with."""
     if store.facts.scale_kind != "relative":
         return 1.0
-    poses = store.trajectory.poses()
-    centers = np.array([i.center for i in store.instances.all()]).reshape(-1, 3)
-    if not poses or not len(centers):
-        return 1.0
-    cameras = np.array([S.translation for _, S in poses[:: -(-len(poses) // 50)]])
-    away = np.linalg.norm(cameras[:, None] - centers[None, :: -(-len(centers) // 1000)], axis=2)
-    return max(float(np.median(away)) / 2.0, 1e-9)
+    world = store.facts[WORLD]
+    return 1.0 if world is None else world.unit

@@ -12,6 +12,7 @@ from list3r.exporters.components import point_spacing
 from list3r.exporters.palette import instance_color, structure_color
 from list3r.memory.core.records import BestView, Instance
 from list3r.queries.changes import Changed
+from list3r.queries.relations import unit_of
 
 CHANGE_COLORS = {"added": (40, 160, 80), "moved": (235, 140, 30), "removed": (210, 50, 60)}
 COLOR_MODES = ("own colour", "instance", "changes")
@@ -109,14 +110,7 @@ def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
     for change in changes:
         newest.setdefault(change.instance.id, change)
     there = {i.id: i for i in shown}
-    return ShownWorld(there, _cloud(memory), newest, 1.0 if memory.units == "m" else _unit(shown))
-
-
-def _unit(instances: list[Instance]) -> float:
-    """About a metre in a relative memory: 1 where instances are as far apart as in a home, else a fifth."""
-    centers = np.array([i.center for i in instances]).reshape(-1, 3)
-    extent = float(np.ptp(centers, axis=0).max()) if len(centers) > 1 else 5.0
-    return 1.0 if 1.0 < extent < 100.0 else max(extent, 1e-9) / 5.0
+    return ShownWorld(there, _cloud(memory), newest, unit_of(memory.store))
 
 
 def _cloud(memory: SceneMemory) -> ShownCloud:

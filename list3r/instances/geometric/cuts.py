@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.frames.base import Frame
 from list3r.instances.base import Proposals
@@ -87,8 +88,6 @@ class CloudDiscoverer(ABC):
 
 def _nearest_voxels(view: View, cloud: Cloud) -> NDArray[np.int32]:
     """Voxel of the cloud nearest to each confirmed pixel of a view that is not part of it, -1 where none is near."""
-    from scipy.spatial import cKDTree
-
     index = np.full(view.depth.shape, -1, np.int32)
     distance, nearest = cKDTree(cloud.points).query(view.points[view.confirmed], distance_upper_bound=3.0 * cloud.voxel)
     index[view.confirmed] = np.where(np.isfinite(distance), nearest, -1)

@@ -9,9 +9,8 @@ import numpy as np
 
 from list3r.memory.core.records import Instance, Observation
 from list3r.memory.library.evidence import Evidence, weigh
-from list3r.memory.library.merging.edges import NONE, links_of
-from list3r.memory.library.merging.nodes import Nodes
-from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
+from list3r.memory.library.overlap.pair_scores import Key, PairScores
+from list3r.memory.library.redundancy import most_like
 from list3r.memory.library.rows import record_alone
 from list3r.memory.library.rules import ConsolidationReport
 from list3r.memory.library.scene import Scene
@@ -29,7 +28,7 @@ def attach(scene: Scene, chunk_id: int) -> ConsolidationReport:
     store, near = scene.store, _near(scene, chunk_id)
     overlaps = scene.overlaps((min(k, chunk_id), max(k, chunk_id)) for k in near)
     scene.scores.write()
-    like = _most_like(scene, chunk_id, overlaps)
+    like = most_like(scene, chunk_id, overlaps, scene.constraints.links.forbids)
     owners = store.observations.owners([*like.values(), *((k, n) for k in near for n in scene.shapes(k).local_id)])
     seen = {key: owners[other] for key, other in like.items() if other in owners}
     alone = [(chunk_id, n) for n in scene.shapes(chunk_id).local_id.tolist() if (chunk_id, n) not in like]
@@ -56,22 +55,6 @@ def _near(scene: Scene, chunk_id: int) -> list[int]:
             count[k] = count.get(k, 0) + 1
     most = sorted(count, key=lambda k: (-count[k], -k))[:_COMPARED]
     return sorted({chunk_id, *most})
-
-
-def _most_like(scene: Scene, chunk_id: int, overlaps: Mapping[tuple[int, int], PairScores]) -> dict[Key, Key]:
-    """Return what of other chunks each local instance is most like, of those that are like any."""
-    shapes = {k: scene.shapes(k) for pair in sorted(overlaps) for k in pair}
-    numbering, order = Numbering(shapes), sorted(shapes)
-    nodes = Nodes.of([shapes[k] for k in order], {k: scene.pose(k) for k in order})
-    links = links_of(nodes, PairTable.of(overlaps, numbering), scene.settings.merging)
-    best: dict[Key, tuple[float, Key]] = {}
-    for n in np.flatnonzero(links.kind != NONE).tolist():
-        a, b = numbering.keys[links.a[n]], numbering.keys[links.b[n]]
-        own, other = (a, b) if a[0] == chunk_id else (b, a)
-        if other[0] != chunk_id and not scene.constraints.links.forbids(own, other):
-            found = float(links.score[n]), other
-            best[own] = max(found, best.get(own, found))
-    return {own: other for own, (_, other) in best.items()}
 
 
 def _weighed(

@@ -10,14 +10,9 @@ from __future__ import annotations
 from list3r.memory.library.attaching import attach
 from list3r.memory.library.derivation import derive
 from list3r.memory.library.overlap.summaries import chunk_summaries
-from list3r.memory.library.rules import (
-    WORLD,
-    ConsolidationReport,
-    ConsolidationSettings,
-    look_at_world,
-    settings_of,
-)
+from list3r.memory.library.rules import ConsolidationReport, ConsolidationSettings, look_at_world, settings_of
 from list3r.memory.library.scene import Scene
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.library.writing import read_known, write_library
 from list3r.memory.store.store import Store
 

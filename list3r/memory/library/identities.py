@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-Key = tuple[int, int]
-"""(chunk id, local id)."""
+from list3r.memory.library.overlap.pair_scores import Key
 
 
 @dataclass(frozen=True)

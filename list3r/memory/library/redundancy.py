@@ -8,7 +8,7 @@ else is derived from it. So a chunk costs what is new in it, not how often its p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,6 @@ import numpy as np
 from list3r.memory.library.merging.edges import NONE, links_of
 from list3r.memory.library.merging.nodes import Nodes
 from list3r.memory.library.overlap.pair_scores import Key, Numbering, PairScores, PairTable
-from list3r.memory.library.overlap.voxels import Ints
 from list3r.memory.library.scene import Scene
 
 
@@ -54,8 +53,9 @@ def find_redundant(scene: Scene) -> Redundant:
             share = np.bincount(met[u].j, met[u].j_on_i, minlength=len(times))
             times += share >= settings.covered
         found = np.flatnonzero(times >= settings.chunks)
-        best = _most_like(scene, k, found, met)
-        fresh = {(k, n): best.get(n, (k, n)) for n in shapes.local_id[found].tolist()}
+        meets = {(u, k): p.only(np.isin(p.j, found)) for u, p in met.items()} if len(found) else {}
+        best = most_like(scene, k, meets) if meets else {}
+        fresh = {(k, n): best.get((k, n), (k, n)) for n in shapes.local_id[found].tolist()}
         fresh = {key: other for key, other in fresh.items() if not _parted(scene, key, other)}
         like |= fresh
         if len(fresh) == len(times):
@@ -68,18 +68,21 @@ def _parted(scene: Scene, key: Key, like: Key) -> bool:
     return scene.constraints.links.forbids(key, like) or (key == like and scene.constraints.speaks_of(key))
 
 
-def _most_like(scene: Scene, k: int, wanted: Ints, met: Mapping[int, PairScores]) -> dict[int, Key]:
-    """Return the local instances of other chunks that some of a chunk are most like, by local id."""
-    if not len(wanted):
-        return {}
-    shapes = {u: scene.shapes(u) for u in (*met, k)}
-    ordered = [shapes[u] for u in sorted(shapes)]
-    nodes, numbering = Nodes.of(ordered, {u: scene.pose(u) for u in shapes}), Numbering(shapes)
-    pairs = {(u, k): p.only(np.isin(p.j, wanted)) for u, p in met.items()}
-    links = links_of(nodes, PairTable.of(pairs, numbering), scene.settings.merging)
-    best: dict[int, tuple[float, Key]] = {}
+def most_like(
+    scene: Scene,
+    chunk_id: int,
+    overlaps: Mapping[tuple[int, int], PairScores],
+    apart: Callable[[Key, Key], bool] = lambda own, other: False,
+) -> dict[Key, Key]:
+    """Return what of other chunks each local instance of a chunk is most like, of what it is not `apart` from."""
+    shapes = {k: scene.shapes(k) for k in sorted({k for pair in overlaps for k in pair})}
+    numbering, nodes = Numbering(shapes), Nodes.of([*shapes.values()], {k: scene.pose(k) for k in shapes})
+    links = links_of(nodes, PairTable.of(overlaps, numbering), scene.settings.merging)
+    best: dict[Key, tuple[float, Key]] = {}
     for n in np.flatnonzero(links.kind != NONE).tolist():
-        found = float(links.score[n]), numbering.keys[links.a[n]]
-        local_id = numbering.keys[links.b[n]][1]
-        best[local_id] = max(found, best.get(local_id, found))
-    return {local_id: key for local_id, (_, key) in best.items()}
+        a, b = numbering.keys[links.a[n]], numbering.keys[links.b[n]]
+        own, other = (a, b) if a[0] == chunk_id else (b, a)
+        if other[0] != chunk_id and not apart(own, other):
+            found = float(links.score[n]), other
+            best[own] = max(found, best.get(own, found))
+    return {own: other for own, (_, other) in best.items()}

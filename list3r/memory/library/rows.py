@@ -17,8 +17,8 @@ from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.voxels import ChunkShapes
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry
 from list3r.memory.library.relations.structure import flagged_only
-from list3r.memory.library.rules import World
 from list3r.memory.library.scene import Scene
+from list3r.memory.library.world.world import World
 
 
 def record_of(

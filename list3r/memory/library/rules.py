@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from list3r.memory.core.description.colors import Reference
 from list3r.memory.core.records import ChunkRow
 from list3r.memory.core.settings import stored_settings
 from list3r.memory.library.change.detection import ChangeSettings
@@ -23,7 +22,7 @@ from list3r.memory.library.relations.settings import RelationSettings
 from list3r.memory.library.relations.structure import StructureSettings
 from list3r.memory.library.scores import RoundingSettings
 from list3r.memory.library.world.gravity import GravitySettings, floor_height, sure_of_up
-from list3r.memory.store.facts import Fact
+from list3r.memory.library.world.world import World
 from list3r.memory.store.store import Store
 
 _POSED = 80
@@ -91,41 +90,6 @@ class ConsolidationReport:
     """Groups of local instances that are not shown: seen too little, or fragments of an instance that is."""
     written: frozenset[int] | None = None
     """Ids to which something came; None where the library was derived."""
-
-
-@dataclass(frozen=True)
-class World:
-    """What every instance of a memory is derived with."""
-
-    unit: float
-    """What a metre is in world units."""
-    light: Reference
-    floor_seen: bool
-    """Whether the floor was seen and somebody knows which way is up; how high it is, is told place by place."""
-    upright: bool
-    """Whether z is up, in the first component."""
-    first: int
-    """The first component."""
-    chunks: int
-    """Chunks when this was looked at."""
-    posed: int
-    """Posed frames, counted up to 80: fewer are asked of an instance in a short memory."""
-    space: str
-    """The embedding space of all chunks; empty where they have several."""
-    sure_of_up: float = 1.0
-    """What relations that need up are as sure as at most."""
-    guessed: bool = False
-    """Whether lengths are guessed metres."""
-    upright_parts: tuple[int, ...] = ()
-    """Other components in which z is up."""
-
-    def stands(self, component: int) -> bool:
-        """Return whether z is up in a component."""
-        return (self.upright and component == self.first) or component in self.upright_parts
-
-
-WORLD = Fact[World | None]("library", World, None)
-"""What the library was derived with; None before it was."""
 
 
 def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s: ConsolidationSettings) -> World:

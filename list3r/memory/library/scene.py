@@ -13,8 +13,9 @@ from list3r.memory.library.merging.movers import PlacedChunks, Tracks
 from list3r.memory.library.overlap.pair_scores import Key, PairScores
 from list3r.memory.library.overlap.summaries import Summaries, cameras_of
 from list3r.memory.library.overlap.voxels import ChunkShapes, Ints
-from list3r.memory.library.rules import ConsolidationSettings, World
+from list3r.memory.library.rules import ConsolidationSettings
 from list3r.memory.library.scores import Pair, PairScoreCache
+from list3r.memory.library.world.world import World
 from list3r.memory.store.store import Store
 
 _FAR_M = 0.5

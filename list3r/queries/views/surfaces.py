@@ -6,17 +6,15 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.memory.core.records import Instance
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 _MAX_POINTS = 4000
 """More points of one instance are thinned out: that is finer than the surfaces are known."""
@@ -52,8 +50,6 @@ class InstanceSurface:
     @cached_property
     def tree(self) -> cKDTree:
         """KD-tree of the points."""
-        from scipy.spatial import cKDTree
-
         return cKDTree(self.points)
 
     @cached_property

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
@@ -192,8 +193,6 @@ def _surface(store: Store, instance: Instance) -> tuple[NDArray[np.float64], flo
     """Return the surface points in the world (N, 3), those of the box where nothing was measured, and how far they lie
     apart: of most of them the second neighbour is nearer, so that squares of that width close the surface.
     """
-    from scipy.spatial import cKDTree
-
     known = store.surfaces.of_instance(instance).points
     points = known[inside_box(known, instance)].astype(np.float64)
     if len(points) < _FEW:

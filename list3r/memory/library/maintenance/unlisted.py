@@ -23,8 +23,9 @@ from list3r.memory.library.overlap.pair_scores import Key
 from list3r.memory.library.overlap.summaries import chunk_summaries
 from list3r.memory.library.overlap.voxels import ChunkShapes, GrownCells, chunk_shapes, coverage
 from list3r.memory.library.rows import record_alone
-from list3r.memory.library.rules import WORLD, settings_of
+from list3r.memory.library.rules import settings_of
 from list3r.memory.library.scene import Scene
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.rows.columns import UNREADABLE
 from list3r.memory.store.store import Store
 

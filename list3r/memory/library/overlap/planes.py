@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from list3r.memory.core.geometry import Array, Sim3
 from list3r.memory.core.records import FrameSamples
@@ -99,8 +99,6 @@ def place_planes(parts: Sequence[tuple[Planes, Sim3]]) -> Planes:
 
 def planar_area(points: Array, normal: Array) -> float:
     """Return the area of the convex hull of points seen along a normal, square units; 0 for fewer than three."""
-    from scipy.spatial import ConvexHull, QhullError
-
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from list3r.memory.core.geometry import Array, OrientedBox, upright_box
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,6 @@ def without_strays(points: Array, neighbours: int = 4, factor: float = 4.0) -> N
     """Return positions of the points that keep company: what lies `factor` times further from its neighbours than is
     usual for the instance is depth noise at an edge, or a bit of something else. Shape (N, 3) -> (M,).
     """
-    from scipy.spatial import cKDTree
-
     if len(points) < 4 * neighbours:
         return np.arange(len(points))
     distance = neighbours_of(points, cKDTree(points), neighbours + 1)[0][:, -1]

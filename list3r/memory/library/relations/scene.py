@@ -6,18 +6,16 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from list3r.memory.core.geometry import Array
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry, neighbours_of
 from list3r.memory.library.relations.settings import RelationSettings
 from list3r.memory.library.relations.symmetry import round_axis, turned
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 T = TypeVar("T")
 
@@ -78,8 +76,6 @@ class RelationScene:
 
     def _tree_of(self, n: int) -> cKDTree:
         """Return the KD-tree of an instance's points."""
-        from scipy.spatial import cKDTree
-
         return cKDTree(self.instances[n].points)
 
     def measure(self, what: str, a: int, b: int, compute: Callable[[RelationScene, int, int], T]) -> T:
@@ -96,8 +92,6 @@ class RelationScene:
 
     def _sampled(self, n: int) -> SampledSurface:
         """Return what is known of an instance's surface: its points, and for what is round its hidden sides too."""
-        from scipy.spatial import cKDTree
-
         points = self.instances[n].points
         axis = self.measure("axis", n, n, _axis) if self._upright and self.in_room[n] else None
         if axis is not None:
@@ -109,8 +103,6 @@ class RelationScene:
 
     def _seen_from_above(self, n: int) -> Footprint:
         """Return an instance as it is seen from above."""
-        from scipy.spatial import cKDTree
-
         points = self.instances[n].points
         sample = points[:: -(-len(points) // _SAMPLE)]
         return Footprint(sample, cKDTree(sample[:, :2]), spacing_of(sample))
@@ -200,8 +192,6 @@ def contact_of(scene: RelationScene, a: int) -> float:
 
 def spacing_of(points: Array) -> float:
     """Return the typical distance between neighbouring points of a layer."""
-    from scipy.spatial import cKDTree
-
     if len(points) < 3:
         return 0.0
     sample = points[:: max(1, len(points) // 100)]
@@ -212,8 +202,6 @@ def hull_under(point: Array, xy: Array) -> tuple[float, float]:
     """Return how far a point lies outside the convex hull of others in the plane, 0 inside, and the area of the
     hull.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     try:
         hull = ConvexHull(xy)
     except (QhullError, ValueError):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from list3r.memory.core.geometry import Array
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry
@@ -102,8 +103,6 @@ def classify_structure(
 
 def _bordered(sheet: Array, floor: Array, unit: float, s: StructureSettings) -> bool:
     """Return whether floor is seen beside a sheet: what no floor surrounds is the floor. Shape (N, 3) each."""
-    from scipy.spatial import cKDTree
-
     cell = s.beside_m * unit / 3.0
     cells = np.unique(np.floor(sheet[:, :2] / cell).astype(np.int64), axis=0)
     filled = {(x, y) for x, y in cells.tolist()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from list3r.memory.core.geometry import Array
 from list3r.memory.library.relations.instance_geometry import InstanceGeometry, neighbours_of
@@ -98,8 +99,6 @@ def _beneath(scene: RelationScene, a: int) -> list[tuple[float, int]]:
 
 def _stands_on(scene: RelationScene, a: int, b: int) -> Sure | None:
     """Return whether a stands on a surface of b: near its bottom, under its middle, with a above it."""
-    from scipy.spatial import cKDTree
-
     s, subject, other = scene.s.on, scene.instances[a], scene.instances[b]
     z = subject.points[:, 2]
     bottom, tolerance = float(np.quantile(z, s.lowest)), contact_of(scene, a)

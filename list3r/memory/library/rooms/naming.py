@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from list3r.memory.core.constraints import Key, standing
 from list3r.memory.core.description.nouns import is_a, names
@@ -84,8 +85,6 @@ def _is_one(label: str, kinds: str) -> bool:
 
 def _by_shape(room: Room) -> tuple[str, str] | None:
     """Return `corridor` for what is long and narrow and was seen whole."""
-    from scipy.spatial import ConvexHull
-
     corners = room.outline[ConvexHull(room.outline).vertices]
     sides = np.roll(corners, -1, axis=0) - corners
     along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
