@@ -50,7 +50,7 @@ def ids(found: Found) -> list[int]:
     [
         ("mug", [MUG]),
         ("mugs", [MUG]),
-        ("the cup", []),
+        ("the cup", [MUG]),
         ("white mug on table", [MUG]),
         ("white mug on the desk", []),
         ("cylinders on the table", [MUG, TWIN]),

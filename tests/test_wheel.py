@@ -16,6 +16,7 @@ import pytest
 
 import list3r
 from list3r.memory.core.errors import DISTRIBUTION, EXTRA_OF_PACKAGE, install_hint
+from list3r.simulation.dataset import WalkSettings, write_walk
 from tests.test_edits import built
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +55,6 @@ def test_the_sdist_holds_what_the_wheel_is_made_of(distributions: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_fresh_environment_asks_a_memory_and_names_what_it_lacks(wheel: Path, tmp_path: Path) -> None:
     python = tmp_path / "venv/bin/python"
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True, timeout=300)
@@ -76,6 +76,16 @@ def test_a_fresh_environment_asks_a_memory_and_names_what_it_lacks(wheel: Path, 
     refused = told("export", "m.l3r", "--to", "glb", "--out", "m.glb")
     assert refused.returncode == 2 and refused.stderr.count("\n") == 1
     assert refused.stderr.endswith(f"pip install '{DISTRIBUTION}[export]'\n")
+
+    subprocess.run([*install[:-1], f"{wheel}[build,export]"], check=True, capture_output=True, timeout=900, env=PLAIN)
+    write_walk(tmp_path / "walk", WalkSettings(frames=30))
+    lines = re.findall(r"```python\n(.+?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(lines) == 1
+    ran = subprocess.run(
+        [python, "-c", lines[0]], capture_output=True, text=True, check=False, timeout=900, env=PLAIN, cwd=tmp_path
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.count("\n") >= 4 and (tmp_path / "house.glb").read_bytes()[:4] == b"glTF"
 
 
 def test_a_checkout_is_installed_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
