@@ -2,9 +2,10 @@
 
     python scripts/trace.py MEMORY [QUESTION] [--build FRAMES] [--json FILE]
 
-The question is `find` in a memory just opened. A file of integrity is one of `INTEGRITY`: what they call counts as
-theirs. Processor time is that of opening and asking, of `find` and of `nearest`, the median of `ROUNDS`. With `--build`
-a made-up walk of so many frames is built too. Another checkout is traced with its folder in PYTHONPATH.
+The question is `find` in a memory just opened, counted without and with the opening. A file of integrity is one of
+`INTEGRITY`: what they call counts as theirs. Processor time is that of opening and asking, of `find` and of `nearest`,
+the median of `ROUNDS`. With `--build` a made-up walk of so many frames is built too. Another checkout is traced with
+its folder in PYTHONPATH.
 """
 
 from __future__ import annotations
@@ -110,9 +111,11 @@ def main() -> None:
 
     ask()  # what is imported and compiled once is not the question's
     nearest()
-    asked = Trace(integrity)
-    asked.run(ask)
-    result: dict[str, Any] = {"question": args.question, "find": asked.figures()}
+    asked, opened = Trace(integrity), Trace(integrity)
+    with list3r.open(args.memory) as memory:
+        asked.run(lambda: memory.find(args.question))
+    opened.run(ask)
+    result: dict[str, Any] = {"question": args.question, "find": asked.figures(), "open + find": opened.figures()}
     result["processor_ms"] = {"open + find": processor_ms(ask), "open + nearest": processor_ms(nearest)}
     if args.build:
         from list3r.simulation.dataset import WalkSettings, write_walk
