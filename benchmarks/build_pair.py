@@ -50,8 +50,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         colour = colour_only(Path(scratch) / "colour", names) if args.colour_only else None
         options = ["--workers", "2", "--force", *_options(args)]
-        for root in roots.values():
-            run_from(root, colour or args.source.resolve(), Path(scratch) / "few.l3r", [*options, "--frames", FEW])
+        for name, root in roots.items():
+            few = Path(scratch) / f"few-{name}.l3r"
+            run_from(root, colour or args.source.resolve(), few, [*options, "--frames", FEW])
         for _ in range(args.rounds):
             for name, root in roots.items():
                 memory = Path(scratch) / f"{name}.l3r"
