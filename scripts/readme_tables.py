@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 from tables.association import alignment, changed, fair, kitchen, methods, registration, returns, worth
 from tables.exports import batches, catalogue, exports, pack, receivers
+from tables.lighter import derivation
 from tables.results import ROOT
 from tables.summary import summary
 from tables.things import changes, discovery, memories, relations, walks
@@ -32,6 +33,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "registration": registration,
     "changed": changed,
     "alignment": alignment,
+    "derivation": derivation,
     "changes": changes,
     "relations": relations,
     "pack": pack,
