@@ -88,13 +88,17 @@ WALKS = (
     BareWalk(seed=14, wall=40, onward=25),
     BareWalk(seed=15, wall=60),
     BareWalk(seed=16, wall=60, onward=25),
+    BareWalk(seed=17, wall=30),
+    BareWalk(seed=18, wall=30, onward=25),
+    BareWalk(seed=19, wall=50),
+    BareWalk(seed=20, wall=15),
 )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=90, help="of each walk without its wall")
-    parser.add_argument("--walks", default="1,2,3,5", help="numbers of those that are filmed")
+    parser.add_argument("--walks", default="0,1,2,3,4,5,6,7,8,9", help="numbers of those that are filmed")
     parser.add_argument("--keep", type=Path, help="folder in which the films are kept")
     parser.add_argument("--colour", action="store_true", help="without depth, by structure from motion")
     parser.add_argument("--json", type=Path)

@@ -16,9 +16,12 @@ from list3r.memory.core.errors import OptionError, TrackingError
 from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.reconstruction.base import backproject
 from list3r.reconstruction.rgbd.confidence import depth_confidence
-from list3r.reconstruction.rgbd.odometry import CameraTracker
+from list3r.reconstruction.rgbd.frame_registration import FrameRegistration
+from list3r.reconstruction.rgbd.odometry import CameraTracker, TrackedSegment
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
-from list3r.reconstruction.rgbd.settings import ConfidenceSettings
+from list3r.reconstruction.rgbd.settings import ConfidenceSettings, OdometrySettings
+from list3r.reconstruction.rgbd.surfels import SurfelModel
+from list3r.reconstruction.rgbd.view import make_view
 from list3r.simulation.dataset import WalkSettings
 from list3r.simulation.rendering.render import RenderedFrame, Renderer
 from list3r.simulation.rendering.sensor import SensorSettings, sense
@@ -203,6 +206,37 @@ def test_noise_of_one_view_does_not_hold_the_camera_before_a_bare_wall() -> None
     frames = [Frame(k, k / 15, f.color, f.depth, None) for k, f in enumerate(seen)]
     with pytest.raises(TrackingError, match="0 to 5"):
         RgbdReconstructor()(frames, CAMERA)
+
+
+def test_a_model_keeps_its_exposure(frames: list[Frame], truth: np.ndarray) -> None:
+    how, small, grays = OdometrySettings(), CAMERA.shrunk(160), []
+    for gain in (1.0, 0.4):
+        model = SurfelModel(how.fusion, how.noise)
+        for k, light in ((0, 1.0), (12, gain)):
+            frame = frames[k]
+            assert frame.depth is not None
+            view = make_view((light * frame.color).astype(np.uint8), frame.depth, small, how.noise)
+            model.fuse(view, np.linalg.inv(truth[0]) @ truth[k])
+        grays.append(model.elements[:, 6].copy())
+    assert len(grays[0]) == len(grays[1]) and np.quantile(np.abs(grays[1] - grays[0]), 0.9) < 15.0
+
+
+def test_places_that_look_alike_on_a_plane_are_not_taken_for_one() -> None:
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, 0, 3] = np.concatenate([x + np.linspace(0.0, 0.1, 10) for x in (-1.5, 0.0, 1.5)])
+    poses[:, 2, 3] = 2.4
+    parts = RgbdReconstructor().parts(frames_along(poses, boxes=()), CAMERA)  # the paper repeats after 3 m
+    assert [int(p.posed.sum()) for p in parts] == [10, 10, 10]
+
+
+def test_a_segment_does_not_begin_by_a_slide_along_a_plane(frames: list[Frame]) -> None:
+    tracker = CameraTracker(frames, CAMERA, OdometrySettings())
+    tracker.run()
+    begun = TrackedSegment(tracker.segments[0].model, {0: np.eye(4)})
+    found = FrameRegistration(np.eye(4), 0.9, 1.0, 1.0, 0.8, 5000, 1e8 * np.eye(6), np.zeros((6, 6)))
+    assert not tracker._settled(begun, 1, found, []) and tracker._settled(
+        begun, 1, replace(found, correlation=0.99), []
+    )
 
 
 def test_a_frame_that_depth_alone_places_says_so(frames: list[Frame], truth: np.ndarray) -> None:

@@ -44,6 +44,8 @@ class SurfelSettings:
     """Most views that an element averages, so that it can still follow a change."""
     normal_agreement: float = 0.6
     """Least cosine between an element and a measurement that update it."""
+    exposure_step: float = 10.0
+    """Change of brightness that is another exposure, about grey levels; less is shading, which is averaged."""
     drop_below: float = 0.02
     """Weight under which an element that later views saw through is dropped."""
 

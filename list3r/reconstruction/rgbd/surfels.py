@@ -50,7 +50,7 @@ class SurfelModel:
     def fuse(self, view: WorkingFrame, T_model_cam: NDArray[np.float64]) -> None:
         """Average the view into the elements that it agrees with, add new ones, weaken those that it sees through.
 
-        Its brightness is brought to the exposure of the model first.
+        Its brightness is brought to the exposure of the model first, where that is another.
         """
         pixel = np.flatnonzero(view.valid)
         R, t = T_model_cam[:3, :3].astype(np.float32), T_model_cam[:3, 3].astype(np.float32)
@@ -60,9 +60,10 @@ class SurfelModel:
         rows[:, :3], rows[:, 3:6] = local @ R.T + t, view.normals.reshape(-1, 3)[pixel] @ R.T
         rows[:, 6], rows[:, 7] = view.gray.ravel()[pixel], (np.float32(self._noise.constant_m) / sigma) ** 2
         element = self.visible(T_model_cam, view.camera)[pixel]
-        met = element >= 0
-        if met.any():
-            rows[:, 6] -= np.median(rows[met, 6] - self.elements[element[met], 6])
+        met = np.flatnonzero(element >= 0)[::8]
+        step = float(np.median(rows[met, 6] - self.elements[element[met], 6])) if len(met) else 0.0
+        if abs(step) > self._settings.exposure_step:
+            rows[:, 6] -= np.float32(step)
         seen = rows, np.ascontiguousarray(local[:, 2]), sigma
         limits = self._settings.normal_agreement, self._settings.weight_cap
         new, through = fuse(self.elements, element, seen, np.ascontiguousarray(T_model_cam[:3, 2]), limits)
