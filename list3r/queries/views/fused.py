@@ -1,27 +1,26 @@
-"""The surface of a scene and of each instance: stored depth fused into a grid of signed distances, then triangles."""
+"""Stored depth fused into a grid of signed distances, and the triangles of that, simplified.
+
+The grid is Open3D's (Dong et al., IEEE TPAMI 2022). Two changes make its surface better on small pictures: it takes the
+pixel below and left of a place for the nearest one, so the camera's centre is moved by half a pixel, and depth is
+interpolated within surfaces.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import importlib
+import importlib.util
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.core.geometry import Sim3
-from list3r.memory.core.masks import decode_mask
-from list3r.memory.core.records import ChunkRow, Instance, Keyframe, Observation
 from list3r.memory.store.store import Store
-from list3r.queries.pictures import decode_picture
 from list3r.queries.relations import unit_of
-from list3r.queries.views.surfaces import inside_box
+from list3r.queries.views.depth_frames import DepthFrame, depth_frames
 
-REST = 0
-"""Stands for the id of what belongs to no instance."""
-_STEP = 0.04
-"""Neighbours whose depth differs by this share lie on two surfaces; what is between them was never seen."""
-_GREY = 150
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -30,14 +29,18 @@ class FusionSettings:
 
     voxel_m: float = 0.02
     """Edge of a cell of the grid."""
-    truncation_voxels: float = 3.0
-    """Distances are kept so far before and behind a surface; what is thinner than that is one surface."""
+    truncation_cells: float = 3.0
+    """Distances are kept so far before and behind a surface; what is thinner is one surface."""
     most_depth_m: float = 4.5
     """Depth beyond is too coarse."""
-    least_weight: float = 0.9
-    """Frames that must have seen a cell."""
     block: int = 8
-    """Cells along a block."""
+    """Cells along a block of the grid."""
+    most_blocks: int = 20_000
+    """Blocks that are in memory at a time, 6 kB each; a larger scene is fused part by part."""
+    kept_share: float = 0.25
+    """Share of the triangles that simplification leaves."""
+    color_m: float = 0.05
+    """Simplification treats white as so much higher than black, so that pictures on a wall stay sharp."""
 
 
 @dataclass(frozen=True)
@@ -47,177 +50,242 @@ class Surface:
     vertices: NDArray[np.float32]
     """Shape (V, 3)."""
     faces: NDArray[np.int32]
-    """Counter-clockwise as seen from where the camera was; none where points alone are known. Shape (F, 3)."""
+    """Counter-clockwise as seen from where the cameras were; none where points alone are known. Shape (F, 3)."""
     rgb: NDArray[np.uint8]
     """Of vertices, sRGB. Shape (V, 3)."""
 
-    def part(self, chosen: NDArray[np.bool_]) -> Surface:
-        """Return some of the faces with their vertices. Shape (F,)."""
-        used, faces = np.unique(self.faces[chosen], return_inverse=True)
+    def with_faces(self, chosen: NDArray[np.int32]) -> Surface:
+        """Return only some of the faces, with their vertices. Shape (F, 3)."""
+        used, faces = np.unique(chosen, return_inverse=True)
         return Surface(self.vertices[used], faces.reshape(-1, 3).astype(np.int32), self.rgb[used])
 
-
-def instance_surface(store: Store, instance_id: int) -> Surface | None:
-    """Return the triangles that were seen of an instance, world coordinates; open where nothing was seen.
-
-    None where no stored depth shows it where it is now. Raises `UnknownIdError`.
-    """
-    instance = store.instances.get(instance_id)
-    return fused_surfaces(store, instance.component).get(instance.id)
+    @staticmethod
+    def of_points(points: NDArray[np.float32], rgb: NDArray[np.uint8]) -> Surface:
+        """Return points alone. Both shape (N, 3)."""
+        return Surface(points, np.zeros((0, 3), np.int32), rgb)
 
 
-def fused_surfaces(store: Store, component: int, settings: FusionSettings | None = None) -> dict[int, Surface]:
-    """Return the triangles of each present instance of a component, by id, and under `REST` those of none."""
+def can_fuse() -> bool:
+    """Tell whether the packages are installed that fusion takes."""
+    return all(importlib.util.find_spec(name) is not None for name in ("open3d", "fast_simplification"))
+
+
+def fused(store: Store, component: int, settings: FusionSettings | None = None) -> tuple[Surface, Ints]:
+    """Return the surface of a component, and whose each face is: ids, `REST` for none. Shape (F,)."""
     s, unit = settings or FusionSettings(), unit_of(store)
-    frames = list(_frames(store, component))
-    if not frames:
-        return {}
-    import open3d.core as o3c
-    from open3d.t.geometry import VoxelBlockGrid
+    fusion = _Fusion(s, s.voxel_m * unit, s.most_depth_m * unit)
+    touched = [fusion.blocks(f) for f in depth_frames(store, component)]
+    blocks = np.unique(np.concatenate([np.zeros((0, 3), np.int64), *touched]), axis=0)
+    boxes = list(_boxes(blocks, s.most_blocks)) if len(blocks) else []
+    parts = []
+    for low, high in boxes:
+        count = int(((blocks >= low - 1) & (blocks <= high + 1)).all(axis=1).sum())
+        part = fusion.part(depth_frames(store, component), (low, high), count)
+        parts.append(_simplified(*part, s, unit, border=len(boxes) > 1))
+    return _joined(parts, 1e-4 * fusion.voxel)
 
-    grid = VoxelBlockGrid(
-        ("tsdf", "weight", "color"), (o3c.float32,) * 3, ((1), (1), (3)), s.voxel_m * unit, s.block, 10_000
+
+def _boxes(blocks: Ints, most: int) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the lowest and highest blocks of parts of at most so many. Shape (N, 3)."""
+    low, high = blocks.min(axis=0), blocks.max(axis=0)
+    axis = int((high - low).argmax())
+    if len(blocks) <= most or low[axis] == high[axis]:
+        yield low, high
+        return
+    here = blocks[:, axis] < max(np.median(blocks[:, axis]), low[axis] + 1)
+    yield from _boxes(blocks[here], most)
+    yield from _boxes(blocks[~here], most)
+
+
+class _Fusion:
+    """Open3D's grid for the frames of one component."""
+
+    def __init__(self, settings: FusionSettings, voxel: float, most_depth: float) -> None:
+        self._s, self.voxel, self._most = settings, voxel, most_depth
+        self._core: Any = importlib.import_module("open3d.core")
+        self._geometry: Any = importlib.import_module("open3d.t.geometry")
+        self._empty = self._grid(1)
+
+    def blocks(self, frame: DepthFrame) -> Ints:
+        """Return the blocks near the depth of a frame. Shape (N, 3)."""
+        return self._near(*self._views(frame)).astype(np.int64)
+
+    def part(self, frames: Iterator[DepthFrame], box: tuple[Ints, Ints], count: int) -> tuple[Surface, Ints]:
+        """Return the surface in the blocks of a box, about so many, and whose each vertex is."""
+        low, high = box
+        size = self.voxel * self._s.block
+        grid, votes = self._grid(count), _Votes(self.voxel)
+        for frame in frames:
+            depth, lens, T_cam_world = self._views(frame)
+            blocks = self._near(depth, lens, T_cam_world)
+            # Triangles of the last cells reach into the next blocks.
+            blocks = blocks[((blocks >= low - 1) & (blocks <= high + 1)).all(axis=1)]
+            if len(blocks):
+                color = self._geometry.Image((frame.colors(2) / np.float32(255)).astype(np.float32))
+                most = (1.0, self._most, self._s.truncation_cells)
+                grid.integrate(self._core.Tensor(blocks), depth, color, lens, T_cam_world, *most)
+                votes.add(frame, low, high, size)
+        mesh = grid.extract_triangle_mesh(0.5)
+        vertices, faces = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32)
+        middle = np.floor(vertices[faces].mean(axis=1) / size)
+        rgb = np.round(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8)
+        surface = Surface(vertices, faces, rgb).with_faces(faces[((middle >= low) & (middle <= high)).all(axis=1)])
+        return surface, votes.of(surface.vertices)
+
+    def _near(self, depth: Any, lens: Any, T_cam_world: Any) -> NDArray[np.int32]:
+        touch = self._empty.compute_unique_block_coordinates
+        try:
+            found = touch(depth, lens, T_cam_world, 1.0, self._most, self._s.truncation_cells)
+        except RuntimeError:  # no depth within reach
+            return np.zeros((0, 3), np.int32)
+        return np.asarray(found.numpy())
+
+    def _views(self, frame: DepthFrame) -> tuple[Any, Any, Any]:
+        fx, fy, cx, cy = (2 * v for v in frame.camera)
+        lens = np.array([[fx, 0, cx + 1.0], [0, fy, cy + 1.0], [0, 0, 1]])  # half a pixel twice
+        return (
+            self._geometry.Image(frame.twice_as_fine()),
+            self._core.Tensor(lens),
+            self._core.Tensor(np.linalg.inv(frame.T_world_cam)),
+        )
+
+    def _grid(self, count: int) -> Any:
+        kinds = (self._core.float32, self._core.uint16, self._core.uint16)
+        return self._geometry.VoxelBlockGrid(
+            ("tsdf", "weight", "color"), kinds, (1, 1, 3), self.voxel, self._s.block, count
+        )
+
+
+# ---------------------------------------------------------------------------------------------- whose it is
+
+_CELLS = 1 << 20
+_TOGETHER = 64
+"""Frames whose votes are added up at once."""
+
+
+class _Votes:
+    """How many pixels of which instance lie in each cell."""
+
+    def __init__(self, cell: float) -> None:
+        self._cell = cell
+        self._counted: list[tuple[Ints, Ints, Ints]] = []
+
+    def add(self, frame: DepthFrame, low: Ints, high: Ints, size: float) -> None:
+        """Count the pixels of a frame that lie in a box of blocks of a size."""
+        points = frame.points()
+        blocks = np.floor(points / size)
+        here = (frame.depth > 0) & ((blocks >= low) & (blocks <= high)).all(axis=2)
+        cells = np.floor(points[here] / self._cell).astype(np.int64) + _CELLS
+        key = (cells @ [1 << 42, 1 << 21, 1]).astype(np.int64)
+        self._counted.append(_counted(key, frame.owner[here], np.ones(len(key), np.int64)))
+        if len(self._counted) > _TOGETHER:
+            self._counted = [self._sum()]
+
+    def of(self, vertices: NDArray[np.float32]) -> Ints:
+        """Return whose most pixels are in the voted cell nearest to each vertex. Shape (V, 3) -> (V,)."""
+        from scipy.spatial import cKDTree
+
+        key, owner = _commonest(*self._sum())
+        cells = np.stack([key >> 42, (key >> 21) & (2 * _CELLS - 1), key & (2 * _CELLS - 1)], axis=1) - _CELLS
+        return np.asarray(owner[cKDTree((cells + 0.5) * self._cell).query(vertices)[1]])
+
+    def _sum(self) -> tuple[Ints, Ints, Ints]:
+        key, owner, count = (np.concatenate(c) for c in zip(*self._counted, strict=True))
+        return _counted(key, owner, count)
+
+
+def _counted(where: Ints, whose: Ints, count: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return each pair once, in order, with the sum of its counts. All shape (N,)."""
+    order = np.lexsort((whose, where))
+    where, whose = where[order], whose[order]
+    first = np.flatnonzero(np.append(True, (np.diff(where) != 0) | (np.diff(whose) != 0))[: len(where)])
+    total = np.add.reduceat(count[order], first) if len(first) else count
+    return where[first], whose[first], total
+
+
+def _commonest(where: Ints, whose: Ints, count: Ints) -> tuple[Ints, Ints]:
+    """Return each place once, in order, and whose it is mostly; pairs are given once each. All shape (N,)."""
+    order = np.lexsort((-count, where))
+    where, whose = where[order], whose[order]
+    first = np.append(True, np.diff(where) != 0)[: len(where)]
+    return where[first], whose[first]
+
+
+# ---------------------------------------------------------------------------------------------- triangles
+
+
+def fewer(surface: Surface, share: float) -> Surface:
+    """Return the surface with about this share of its triangles, its edge as it is; points are drawn by lot."""
+    count = len(surface.vertices)
+    if not len(surface.faces):
+        chosen = np.sort(np.random.default_rng(count).permutation(count)[: int(np.ceil(share * count))])
+        return Surface.of_points(surface.vertices[chosen], surface.rgb[chosen])
+    s = FusionSettings(kept_share=share, color_m=0.02 * float(np.ptp(surface.vertices, axis=0).max()))
+    return _simplified(surface, np.zeros(count, np.int64), s, 1.0, border=True)[0]
+
+
+def _simplified(surface: Surface, owner: Ints, s: FusionSettings, unit: float, *, border: bool) -> tuple[Surface, Ints]:
+    """Return fewer triangles by quadric errors (Garland and Heckbert 1997), and whose each vertex is.
+
+    The errors are those of the surface raised by its brightness. With `border` the edge of the surface stays as it is.
+    """
+    import fast_simplification
+
+    most = int(s.kept_share * len(surface.faces))
+    if not most:
+        return surface, owner
+    raise_by = s.color_m * unit * _brightness(surface)[:, None] * _normals(surface)
+    vertices, faces, steps = fast_simplification.simplify(
+        surface.vertices + raise_by,
+        np.ascontiguousarray(surface.faces),
+        target_count=most,
+        return_collapses=True,
+        preserve_border=border,
     )
-    votes = []
-    for frame in frames:
-        frame.into(grid, s, unit)
-        votes.append(frame.votes(s.voxel_m * unit))
-    mesh = grid.extract_triangle_mesh(s.least_weight)
-    whole = Surface(
-        mesh.vertex.positions.numpy(),
-        mesh.triangle.indices.numpy().astype(np.int32),
-        np.round(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8),
+    into = np.arange(len(owner))
+    into[steps[:, 1]] = steps[:, 0]
+    while (into[into] != into).any():
+        into = into[into]
+    left = surface.faces[(into[surface.faces] != np.roll(into[surface.faces], 1, axis=1)).all(axis=1)]
+    kept = np.unique(into[left])  # in the order of the vertices
+    there = np.isin(into, kept)
+    of = np.searchsorted(kept, into[there])
+    _, whose = _commonest(*_counted(of, owner[there], np.ones_like(of)))
+    rgb = np.round(_means(surface.rgb[there], of)).astype(np.uint8)
+    vertices = (vertices - _means(raise_by[there], of)).astype(np.float32)
+    return Surface(vertices, faces.astype(np.int32), rgb), whose
+
+
+def _means(rows: NDArray[Any], of: Ints) -> NDArray[np.float64]:
+    """Return the mean of the rows of each group; `of` numbers them from 0. Shape (N, 3) -> (G, 3)."""
+    sums = np.stack([np.bincount(of, rows[:, k]) for k in range(3)], axis=1)
+    return np.asarray(sums / np.maximum(np.bincount(of), 1)[:, None])
+
+
+def _brightness(surface: Surface) -> NDArray[np.float64]:
+    return np.asarray(surface.rgb @ np.array([0.299, 0.587, 0.114]) / 255)
+
+
+def _normals(surface: Surface) -> NDArray[np.float64]:
+    a, b, c = (surface.vertices[surface.faces[:, k]].astype(np.float64) for k in range(3))
+    across = np.cross(b - a, c - a)
+    out = np.stack(
+        [np.bincount(surface.faces.ravel(), np.repeat(across[:, k], 3), len(surface.vertices)) for k in range(3)], 1
     )
-    owner = _owners(whole.vertices, np.concatenate(votes), s.voxel_m * unit)
-    of_face = np.sort(owner[whole.faces], axis=1)[:, 1]  # that of two of three, else any
-    return {n: whole.part(of_face == n) for n in np.unique(of_face).tolist()}
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-30))
 
 
-@dataclass(frozen=True)
-class DepthFrame:
-    """One keyframe in the world."""
-
-    T_world_cam: NDArray[np.float64]
-    """Shape (4, 4)."""
-    depth: NDArray[np.float32]
-    """Along z, world units, 0 where unknown. Shape (h, w)."""
-    rgb: NDArray[np.uint8]
-    """Shape (h, w, 3)."""
-    owner: NDArray[np.int64]
-    """Ids of instances, `REST` for none. Shape (h, w)."""
-    camera: tuple[float, float, float, float]
-    """fx, fy, cx, cy, px."""
-
-    def points(self) -> NDArray[np.float64]:
-        """Return world coordinates of all pixels. Shape (h, w, 3)."""
-        fx, fy, cx, cy = self.camera
-        rows, columns = np.indices(self.depth.shape)
-        local = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(self.depth.shape)], axis=2)
-        local *= self.depth[..., None]
-        return np.asarray(local @ self.T_world_cam[:3, :3].T + self.T_world_cam[:3, 3])
-
-    def votes(self, cell: float) -> NDArray[np.int64]:
-        """Return the cells in which pixels lie, whose they are, and how many. Shape (N, 5)."""
-        seen = self.depth > 0
-        where = np.floor(self.points()[seen] / cell).astype(np.int64)
-        found, count = np.unique(np.column_stack([where, self.owner[seen]]), axis=0, return_counts=True)
-        return np.column_stack([found, count])
-
-    def into(self, grid: Any, s: FusionSettings, unit: float) -> None:
-        """Add the depth to a grid."""
-        import open3d.core as o3c
-        from open3d.t.geometry import Image
-
-        fx, fy, cx, cy = self.camera
-        lens = o3c.Tensor(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
-        T_cam_world = o3c.Tensor(np.linalg.inv(self.T_world_cam))
-        depth, color = Image(self.depth), Image((self.rgb / 255.0).astype(np.float32))
-        most = s.most_depth_m * unit
-        blocks = grid.compute_unique_block_coordinates(depth, lens, T_cam_world, 1.0, most, s.truncation_voxels)
-        grid.integrate(blocks, depth, color, lens, T_cam_world, 1.0, most, s.truncation_voxels)
-
-
-def _owners(vertices: NDArray[np.float32], votes: NDArray[np.int64], cell: float) -> NDArray[np.int64]:
-    """Return whose most pixels are that lie near each vertex. Shape (V,)."""
-    from scipy.spatial import cKDTree
-
-    rows, which = np.unique(votes[:, :4], axis=0, return_inverse=True)
-    count = np.bincount(which.ravel(), votes[:, 4])
-    order = np.lexsort((-count, *rows[:, :3].T[::-1]))
-    rows = rows[order]
-    first = np.concatenate([[True], (np.diff(rows[:, :3], axis=0) != 0).any(axis=1)])
-    tree = cKDTree((rows[first, :3] + 0.5) * cell)
-    return np.asarray(rows[first, 3][tree.query(vertices)[1]])
-
-
-# ---------------------------------------------------------------------------------------------- frames
-
-
-def _frames(store: Store, component: int) -> Iterator[DepthFrame]:
-    """Yield the keyframes of a component that have depth; of those that two chunks share the first."""
-    there = {i.id: i for i in store.instances.all() if i.state != "removed" and np.isfinite(i.aabb).all()}
-    seen: dict[int, list[Observation]] = {}
-    for o in store.observations.all():
-        seen.setdefault(o.chunk_id, []).append(o)
-    done: set[tuple[int, int]] = set()
-    for chunk in store.chunks.all():
-        if chunk.component != component:
-            continue
-        kept = {(chunk.session_id, k.frame_index): k for k in store.keyframes.of(chunk.chunk_id) if k.depth_small.size}
-        fresh = [k for key, k in kept.items() if key not in done]
-        done |= set(kept)
-        masks = _masks(store, seen.get(chunk.chunk_id, []), [k.frame_index for k in fresh])
-        for k in fresh:
-            yield _frame(chunk, k, masks.get(k.frame_index, []), there)
-
-
-Masks = list[tuple[int, int, NDArray[np.uint32]]]
-"""Area, id of the instance and run-length code."""
-
-
-def _masks(store: Store, seen: Sequence[Observation], frames: Sequence[int]) -> dict[int, Masks]:
-    """Return the masks in some frames of a chunk of what was seen in it."""
-    out: dict[int, Masks] = {}
-    for o in seen:
-        track = store.local_instances.mask_track(o.chunk_id, o.local_id)
-        for n in np.flatnonzero(np.isin(track.frames, frames)).tolist():
-            out.setdefault(int(track.frames[n]), []).append((int(track.areas_px[n]), o.instance_id, track.masks[n]))
-    return out
-
-
-def _frame(chunk: ChunkRow, k: Keyframe, masks: Masks, there: Mapping[int, Instance]) -> DepthFrame:
-    """Return a keyframe without what is between two surfaces, or belongs to an instance that is now elsewhere."""
-    S = chunk.S_world_chunk @ Sim3.from_matrix(k.T_chunk_cam)
-    T_world_cam = np.eye(4)
-    T_world_cam[:3, :3], T_world_cam[:3, 3] = S.rotation, S.translation
-    h, w = k.depth_small.shape
-    depth = np.where(_on_one_surface(k.depth_small), k.depth_small * float(S.scale), 0).astype(np.float32)
-    height, width = chunk.image_size
-    v = np.minimum(((np.arange(h) + 0.5) * height / h).astype(np.int64), height - 1)
-    u = np.minimum(((np.arange(w) + 0.5) * width / w).astype(np.int64), width - 1)
-    owner = np.full((h, w), REST, np.int64)
-    for _, n, mask in sorted(masks, key=lambda m: -m[0]):  # what is smaller lies before what is larger
-        owner[decode_mask(mask, (height, width))[np.ix_(v, u)]] = n
-    frame = DepthFrame(T_world_cam, depth, _colors(k, (h, w)), owner, k.camera_small)
-    points = frame.points()
-    for n in np.setdiff1d(owner, REST).tolist():
-        mine = owner == n
-        here = inside_box(points[mine], there[n]) if n in there else False
-        depth[mine] = np.where(here, depth[mine], 0)
-    return frame
-
-
-def _colors(k: Keyframe, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    if not k.jpeg:
-        return np.full((*shape, 3), _GREY, np.uint8)
-    from PIL import Image
-
-    picture = Image.fromarray(decode_picture(k.jpeg))
-    return np.asarray(picture.resize((shape[1], shape[0]), Image.Resampling.BOX))
-
-
-def _on_one_surface(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which pixels have depth that their four neighbours share. Shape (h, w)."""
-    around = np.pad(depth, 1, mode="edge")
-    beside = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
-    return np.asarray((depth > 0) & np.all([np.abs(n - depth) < _STEP * depth for n in beside], axis=0))
+def _joined(parts: list[tuple[Surface, Ints]], step: float) -> tuple[Surface, Ints]:
+    """Return parts as one surface, the vertices at their seams once, and whose each face is: two of its corners'."""
+    if not parts:
+        return Surface.of_points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)), np.zeros(0, np.int64)
+    starts = np.cumsum([0, *(len(p.vertices) for p, _ in parts)])
+    vertices, rgb = (np.concatenate([getattr(p, n) for p, _ in parts]) for n in ("vertices", "rgb"))
+    faces = np.concatenate([p.faces + n for (p, _), n in zip(parts, starts, strict=False)])
+    owner = np.concatenate([o for _, o in parts])
+    if len(parts) > 1:
+        _, first, which = np.unique(np.round(vertices / step), axis=0, return_index=True, return_inverse=True)
+        vertices, rgb, owner, faces = vertices[first], rgb[first], owner[first], which.ravel()[faces].astype(np.int32)
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    faces = faces[whole]
+    return Surface(vertices, faces, rgb), np.sort(owner[faces], axis=1)[:, 1]
