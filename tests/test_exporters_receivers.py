@@ -238,7 +238,7 @@ def test_the_scene_page_loads_nothing_escapes_names_and_keeps_its_size(room: Pat
         assert cloud["kept"] < cloud["known"] == data["cloud"]["known"] and all(many for _, many, *_ in cloud["runs"])
         raw = base64.b64decode(text.split('id="points">')[1].split("</script>")[0])
         whole = data["cloud"]
-        steps = np.frombuffer(raw, "<u2", 3 * whole["kept"]).reshape(-1, 3)
+        steps = np.frombuffer(raw, "<u2", 3 * whole["kept"], 12 * whole["faces"]).reshape(-1, 3)
         places = np.array(whole["low"]) + whole["span"] * steps / 65535
         starts = np.cumsum([0, *(many for _, many, *_ in whole["runs"])])
         known = memory.surfaces()

@@ -94,6 +94,12 @@ def _glb(store: Store, component: Component, settings: GlbSettings) -> bytes:
     return bytes(scene.export(file_type="glb", unitize_normals=False, tree_postprocessor=_finish))
 
 
+def surface_glb(vertices: NDArray[np.float32], faces: NDArray[np.int32], rgb: NDArray[np.uint8]) -> bytes:
+    """Return triangles alone, in coordinates as they are. Shapes (V, 3), (F, 3), (V, 3)."""
+    scene = trimesh.Scene(_drawn(Surface(vertices, faces, rgb), rgb))
+    return bytes(scene.export(file_type="glb", unitize_normals=False, tree_postprocessor=_finish))
+
+
 def _finish(tree: dict[str, Any]) -> None:
     """Set the target of attribute views, which glTF validators ask for and trimesh leaves out; triangles show their
     colours as they are, since these hold the light of the room.

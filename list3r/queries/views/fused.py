@@ -59,6 +59,23 @@ class Surface:
         used, faces = np.unique(chosen, return_inverse=True)
         return Surface(self.vertices[used], faces.reshape(-1, 3).astype(np.int32), self.rgb[used])
 
+    def sampled(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return points on the faces, by lot, and their colours. Shape (count, 3) both."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).astype(np.float64)
+        chosen = rng.choice(len(area), count, p=area / area.sum()) if area.any() else rng.choice(len(area), count)
+        weight = rng.dirichlet((1.0, 1.0, 1.0), count)[:, :, None]
+        points, rgb = ((values[self.faces[chosen]] * weight).sum(axis=1) for values in (self.vertices, self.rgb))
+        return points.astype(np.float32), np.round(rgb).astype(np.uint8)
+
+    def normals(self) -> NDArray[np.float64]:
+        """Return unit normals of vertices, the faces around each weighted with their areas. Shape (V, 3)."""
+        a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+        sums = [np.bincount(self.faces.ravel(), across[:, k], len(self.vertices)) for k in range(3)]
+        out = np.stack(sums, axis=1)
+        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-30))
+
     @staticmethod
     def of_points(points: NDArray[np.float32], rgb: NDArray[np.uint8]) -> Surface:
         """Return points alone. Both shape (N, 3)."""
@@ -234,7 +251,7 @@ def _simplified(surface: Surface, owner: Ints, s: FusionSettings, unit: float, *
     most = int(s.kept_share * len(surface.faces))
     if not most:
         return surface, owner
-    raise_by = s.color_m * unit * _brightness(surface)[:, None] * _normals(surface)
+    raise_by = s.color_m * unit * _brightness(surface)[:, None] * surface.normals()
     vertices, faces, steps = fast_simplification.simplify(
         surface.vertices + raise_by,
         np.ascontiguousarray(surface.faces),
@@ -264,15 +281,6 @@ def _means(rows: NDArray[Any], of: Ints) -> NDArray[np.float64]:
 
 def _brightness(surface: Surface) -> NDArray[np.float64]:
     return np.asarray(surface.rgb @ np.array([0.299, 0.587, 0.114]) / 255)
-
-
-def _normals(surface: Surface) -> NDArray[np.float64]:
-    a, b, c = (surface.vertices[surface.faces[:, k]].astype(np.float64) for k in range(3))
-    across = np.cross(b - a, c - a)
-    out = np.stack(
-        [np.bincount(surface.faces.ravel(), np.repeat(across[:, k], 3), len(surface.vertices)) for k in range(3)], 1
-    )
-    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-30))
 
 
 def _joined(parts: list[tuple[Surface, Ints]], step: float) -> tuple[Surface, Ints]:
