@@ -142,11 +142,9 @@ class _Fusion:
                 most = (1.0, self._most, self._s.truncation_cells)
                 grid.integrate(self._core.Tensor(blocks), depth, color, lens, T_cam_world, *most)
                 votes.add(frame, low, high, size)
-        mesh = grid.extract_triangle_mesh(0.5)
-        vertices, faces = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32)
-        middle = np.floor(vertices[faces].mean(axis=1) / size)
-        rgb = np.round(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8)
-        surface = Surface(vertices, faces, rgb).with_faces(faces[((middle >= low) & (middle <= high)).all(axis=1)])
+        surface = _in_order(grid.extract_triangle_mesh(0.5))
+        middle = np.floor(surface.vertices[surface.faces].mean(axis=1) / size)
+        surface = surface.with_faces(surface.faces[((middle >= low) & (middle <= high)).all(axis=1)])
         return surface, votes.of(surface.vertices)
 
     def _near(self, depth: Any, lens: Any, T_cam_world: Any) -> NDArray[np.int32]:
@@ -229,6 +227,19 @@ def _commonest(where: Ints, whose: Ints, count: Ints) -> tuple[Ints, Ints]:
 
 
 # ---------------------------------------------------------------------------------------------- triangles
+
+
+def _in_order(mesh: Any) -> Surface:
+    """Return Open3D's triangles in the same order every time; its threads give them in any."""
+    vertices, faces = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
+    order = np.lexsort(vertices.T)
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    faces = place[faces]
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, turn, axis=1)
+    rgb = np.round(255 * mesh.vertex.colors.numpy().clip(0, 1)).astype(np.uint8)
+    return Surface(vertices[order], faces[np.lexsort(faces.T)], rgb[order])
 
 
 def fewer(surface: Surface, share: float) -> Surface:
