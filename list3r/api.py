@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from list3r.queries.rooms import RoomPath
     from list3r.queries.seen import Sightings
     from list3r.queries.views.camera import PosedCamera
+    from list3r.queries.views.fused import Surface
 
 
 P = ParamSpec("P")
@@ -382,13 +383,16 @@ class SceneMemory(MemoryEdits):
         return footprints_of(self.store, [self.instance(instance_id)])[0]
 
     @_alone
-    def surfaces(self) -> dict[int, Support]:
-        """Return all points that are known of each present instance, by id, and under 0 those of no instance, from the
-        pictures that are kept; world coordinates. The most that there is to look at.
-        """
-        from list3r.queries.views.dense import dense_surfaces
+    def surfaces(self) -> dict[int, Surface]:
+        """Return the surface of each present instance, by id, and under 0 what is of none, in world coordinates:
+        coloured triangles fused from stored depth, open where nothing was seen. The most that there is to look at.
 
-        return dense_surfaces(self.store)
+        Points without faces where the extra `surfaces` is not installed or no stored depth shows an instance. Fusing
+        takes seconds the first time, and is kept in the user's cache.
+        """
+        from list3r.queries.views.dense import surfaces
+
+        return surfaces(self.store)
 
     @_alone
     def track(self, instance_id: int | Instance) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

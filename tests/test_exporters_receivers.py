@@ -232,18 +232,18 @@ def test_the_scene_page_loads_nothing_escapes_names_and_keeps_its_size(room: Pat
         assert links.addresses == [] and links.elements.count("script") == 3 and "b" not in links.elements
         data = json.loads(text.split('id="data">')[1].split("</script>")[0])
         assert data["instances"][2]["name"] == shown(NASTY) and data["units"] == memory.units
-        assert data["cloud"]["kept"] == data["cloud"]["known"] == sum(many for _, many, _ in data["cloud"]["runs"])
+        assert data["cloud"]["kept"] == data["cloud"]["known"] == sum(many for _, many, *_ in data["cloud"]["runs"])
         few = write_web(memory, tmp_path / "few.html", WebSettings(megabytes=0.001))[0].read_text(encoding="utf-8")
         cloud = json.loads(few.split('id="data">')[1].split("</script>")[0])["cloud"]
-        assert cloud["kept"] < cloud["known"] == data["cloud"]["known"] and all(many for _, many, _ in cloud["runs"])
+        assert cloud["kept"] < cloud["known"] == data["cloud"]["known"] and all(many for _, many, *_ in cloud["runs"])
         raw = base64.b64decode(text.split('id="points">')[1].split("</script>")[0])
         whole = data["cloud"]
-        steps = np.frombuffer(raw, "<u2", 3 * whole["kept"]).reshape(-1, 3)
+        steps = np.frombuffer(raw, "<u2", 3 * whole["kept"], 12 * whole["faces"]).reshape(-1, 3)
         places = np.array(whole["low"]) + whole["span"] * steps / 65535
-        starts = np.cumsum([0, *(many for _, many, _ in whole["runs"])])
+        starts = np.cumsum([0, *(many for _, many, *_ in whole["runs"])])
         known = memory.surfaces()
-        for (n, many, _), start in zip(whole["runs"], starts, strict=False):
-            assert places[start : start + many] == pytest.approx(known[n].points, abs=whole["span"] / 60000)
+        for (n, many, *_), start in zip(whole["runs"], starts, strict=False):
+            assert places[start : start + many] == pytest.approx(known[n].vertices, abs=whole["span"] / 60000)
 
 
 def test_a_pipe_gets_one_whole_file(room: Path, tmp_path: Path, make_memory: Callable[..., Path]) -> None:

@@ -1,4 +1,4 @@
-"""The points that one page draws: as many at rest as it draws in half a second, fewer while its camera moves."""
+"""The surfaces that one page draws: as much at rest as it draws in half a second, less while its camera moves."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from list3r.exporters.glb import surface_glb
+from list3r.queries.views.fused import Surface, fewer
 from list3r.viewer.names import PageNames
-from list3r.viewer.world import ShownCloud, ShownWorld, close_by, colors, overview, point_size
+from list3r.viewer.world import ShownCloud, ShownWorld, close_by, colors, overview, point_size, sheet_colors
 
 FINE = "/fine"
 """Nodes below this one are hidden while the camera of a slow page moves."""
@@ -37,7 +39,9 @@ class CloudSettings:
     probe_s: float = 0.05
     """Slower drawing is not timed with more points."""
     never_slow_points: int = 20_000
-    """Memories with fewer points are drawn in full without timing."""
+    """Memories with fewer points, or triangles, are drawn in full without timing."""
+    most_faces: int = 1_000_000
+    """Triangles that a page is given, at most."""
     pause_s: float = 1.0
     """A slow page's camera rests when it has not moved for this long; its fine pictures take up to `rest_s`."""
 
@@ -56,10 +60,33 @@ class Drawing:
         return other is not None and other.world is self.world and other == self
 
     def allowed(self) -> NDArray[np.int64]:
-        """Return how many points of each instance may be drawn. Shape (K,)."""
+        """Return how many points of each instance may be met by a click. Shape (K,)."""
         ids = self.world.cloud.ids.tolist()
-        drawn = np.array([self.points and (self.structure or self.world.solid(n)) for n in ids], bool)
+        drawn = np.array([self._draws(n) for n in ids], bool)
         return np.where(drawn, self.world.cloud.counts, 0)
+
+    @property
+    def faces(self) -> int:
+        """How many triangles there are."""
+        return sum(len(s.faces) for s in self.world.sheets.values())
+
+    def dots(self) -> NDArray[np.int64]:
+        """Return how many points of each instance may be drawn: of those without triangles. Shape (K,)."""
+        return np.where([n in self.world.sheets for n in self.world.cloud.ids.tolist()], 0, self.allowed())
+
+    def sheets(self, share: float = 1.0) -> bytes | None:
+        """Return the triangles, or about a share of them, as binary glTF; None where there are none to draw."""
+        chosen = {n: s for n, s in self.world.sheets.items() if self._draws(n)}
+        if not chosen:
+            return None
+        inked = [Surface(s.vertices, s.faces, sheet_colors(self.world, n, self.mode)) for n, s in chosen.items()]
+        parts = [fewer(s, share) if share < 1 else s for s in inked]
+        starts = np.cumsum([0, *(len(s.vertices) for s in parts)])
+        faces = np.concatenate([s.faces + n for s, n in zip(parts, starts, strict=False)]).astype(np.int32)
+        return surface_glb(np.concatenate([s.vertices for s in parts]), faces, np.concatenate([s.rgb for s in parts]))
+
+    def _draws(self, instance_id: int) -> bool:
+        return self.points and (self.structure or self.world.solid(instance_id))
 
 
 class PageClouds:
@@ -75,6 +102,8 @@ class PageClouds:
         self._moving = False
         self.seconds_a_point: float | None = None
         """As measured on the page; None where it was not, and then all is drawn."""
+        self.seconds_of_sheets = 0.0
+        """What drawing all triangles takes, as measured on the page; 0 where it was not."""
 
     @property
     def at_rest(self) -> bool:
@@ -91,8 +120,13 @@ class PageClouds:
         """Draw a world; the first time, the page's drawing speed is measured."""
         with self._lock:
             before, self._shown = self._shown, shown
-            if before is None and shown.world.cloud.counts.sum() > self._settings.never_slow_points:
-                self.seconds_a_point = self._measured(shown.world.cloud)
+            if before is None:
+                if shown.dots().sum() > self._settings.never_slow_points:
+                    self.seconds_a_point = self._measured(shown.world.cloud)
+                if shown.faces > self._settings.never_slow_points:
+                    self.seconds_of_sheets = self._measured_sheets()
+            at_rest = self._settings.rest_s / max(self.seconds_of_sheets, 1e-12)
+            self._sheet("/fine/sheets/all", min(1.0, at_rest, self._settings.most_faces / max(shown.faces, 1)))
             self._clear("/fine/detail")
             self._cloud("/fine/points", self._part(self._overview()), "circle")
             self._detail_at = None
@@ -115,16 +149,16 @@ class PageClouds:
 
     @property
     def slow(self) -> bool:
-        """Whether all points take the page longer than a moving picture may."""
-        if self._shown is None or self.seconds_a_point is None:
+        """Whether all surfaces take the page longer than a moving picture may."""
+        if self._shown is None:
             return False
-        most = min(int(self._shown.world.cloud.counts.sum()), self._settings.overview_points)
-        return most * self.seconds_a_point > self._settings.moving_s
+        most = min(int(self._shown.dots().sum()), self._settings.overview_points)
+        return most * (self.seconds_a_point or 0.0) + self.seconds_of_sheets > self._settings.moving_s
 
     def _overview(self) -> NDArray[np.int64]:
         """How many points of each instance are there at rest. Shape (K,)."""
         assert self._shown is not None
-        counts = self._shown.allowed()
+        counts = self._shown.dots()
         most = min(self._settings.overview_points, self.most_points)
         return counts if counts.sum() <= most else overview(counts, int(min(most, max(self.most_points / 2, 1))))
 
@@ -134,9 +168,13 @@ class PageClouds:
 
     def _draw_coarse(self) -> None:
         self._clear("/coarse/points")
-        if self.slow and self._shown is not None and self.seconds_a_point is not None:
-            most = int(self._settings.moving_s / self.seconds_a_point)
-            self._cloud("/coarse/points", self._part(overview(self._shown.allowed(), most)), "square")
+        self._clear("/coarse/sheets")
+        if not self.slow or self._shown is None:
+            return
+        dots = self._shown.dots()
+        most = self._settings.moving_s / max(self.seconds_a_point or 0.0, 1e-12)
+        self._cloud("/coarse/points", self._part(overview(dots, int(min(most, dots.sum())))), "square")
+        self._sheet("/coarse/sheets/all", min(1.0, self._settings.moving_s / max(self.seconds_of_sheets, 1e-12)))
 
     def _draw_detail(self) -> None:
         """Draw points that the overview leaves out, of the instances near the camera; structure is not among them."""
@@ -149,7 +187,7 @@ class PageClouds:
             return
         self._detail_at, world = place, self._shown.world
         objects = np.array([world.solid(n) for n in world.cloud.ids.tolist()], bool)
-        hidden = np.where(objects, world.cloud.counts - low, 0)
+        hidden = np.where(objects, self._shown.dots() - low, 0)
         most = min(self._settings.detail_points, self.most_points - low.sum())
         self._clear("/fine/detail")
         if hidden.any() and most > 0:
@@ -194,6 +232,20 @@ class PageClouds:
             if taken - without > self._settings.probe_s:
                 break
         return seconds
+
+    def _measured_sheets(self) -> float:
+        """Seconds that the page takes to draw all triangles; 0 where it does not tell."""
+        without = self._fastest()
+        self._sheet("/fine/sheets/all", 1.0)
+        taken = self._fastest()
+        return 0.0 if without is None or taken is None else max(taken - without, 0.0)
+
+    def _sheet(self, name: str, share: float) -> None:
+        """Draw about a share of the triangles."""
+        self._clear(name.rsplit("/", 1)[0])
+        content = None if self._shown is None else self._shown.sheets(share)
+        if content is not None:
+            self._nodes[name] = self._client.scene.add_glb(name, content, cast_shadow=False, receive_shadow=False)
 
     def _fastest(self) -> float | None:
         """The shortest time of a few small pictures, in seconds; None where the page gives none."""

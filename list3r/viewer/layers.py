@@ -10,12 +10,15 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from list3r.exporters.glb import surface_glb
 from list3r.memory.core.geometry import OrientedBox, quat_wxyz_from_rotation
 from list3r.memory.core.records import Relation
 from list3r.viewer.clouds import FINE
-from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, colors, point_size
+from list3r.viewer.world import CHANGE_COLORS, CameraPath, ShownWorld, colors, point_size, sheet_colors
 
 _INK = (255, 200, 0)
+_BEFORE = 0.002
+"""The selected surface is drawn so far before itself."""
 _MEASURED = (230, 40, 90)
 _EDGES = np.array([(a, a ^ bit) for a in range(8) for bit in (1, 2, 4) if a < a ^ bit])
 """Pairs of corners of `OrientedBox.corners` that an edge joins."""
@@ -49,7 +52,9 @@ class Layers:
             return
         nodes = [self._boxes(f"{FINE}/box", [world.instances[selected].box], [_INK])]
         cloud = world.cloud.of(selected, self._settings.selected_points)
-        if visible and len(cloud.points):
+        if visible and selected in world.sheets:
+            nodes.append(self._scene.add_glb(f"{FINE}/selected", _tinted(world, mode, selected)))
+        elif visible and len(cloud.points):
             middle = cloud.points.mean(axis=0)
             size = 1.5 * float(point_size(cloud.spacing[cloud.counts > 0], world.unit)[0])
             nodes.append(
@@ -155,3 +160,11 @@ class Layers:
             ]
         elif ends:
             self._nodes["measured"] = [self._scene.add_label("/measured/text", text, position=ends[0])]
+
+
+def _tinted(world: ShownWorld, mode: str, selected: int) -> bytes:
+    """Return the triangles of an instance, tinted, a little before themselves."""
+    sheet = world.sheets[selected]
+    ink = np.round(0.5 * sheet_colors(world, selected, mode) + 0.5 * np.array(_INK)).astype(np.uint8)
+    raised = sheet.vertices + _BEFORE * world.unit * sheet.normals()
+    return surface_glb(raised.astype(np.float32), sheet.faces, ink)

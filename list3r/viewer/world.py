@@ -13,19 +13,22 @@ from list3r.exporters.palette import instance_color, structure_color
 from list3r.memory.core.records import BestView, Instance
 from list3r.queries.changes import Changed
 from list3r.queries.relations import unit_of
+from list3r.queries.views.fused import Surface
 
 CHANGE_COLORS = {"added": (40, 160, 80), "moved": (235, 140, 30), "removed": (210, 50, 60)}
 COLOR_MODES = ("own colour", "instance", "changes")
 UNCHANGED = (190, 190, 195)
 _SELECTED = (255, 200, 0)
+_POINTS_A_FACE = 4
+"""Of triangles, which clicks meet."""
 _RAY_RADIUS = 0.008
 """Radius of a ray as a share of the points' depth: about the size at which they are drawn."""
 
 
 @dataclass(frozen=True)
 class ShownCloud:
-    """Surface points of many instances, concatenated; each in random order, so that any prefix is a coarser cloud. 15
-    bytes a point, so that tens of millions fit. Id 0 stands for what belongs to no instance.
+    """Points on the surfaces of many instances, concatenated; each in random order, so that any prefix is a coarser
+    cloud. 15 bytes a point, so that tens of millions fit. Id 0 stands for what belongs to no instance.
     """
 
     points: NDArray[np.float32]
@@ -87,6 +90,8 @@ class ShownWorld:
 
     instances: dict[int, Instance]
     cloud: ShownCloud
+    sheets: dict[int, Surface]
+    """Those surfaces that have triangles, which are drawn instead of their points."""
     changes: dict[int, Changed]
     """The newest change of each instance."""
     unit: float
@@ -109,18 +114,23 @@ def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
     newest: dict[int, Changed] = {}
     for change in changes:
         newest.setdefault(change.instance.id, change)
-    there = {i.id: i for i in shown}
-    return ShownWorld(there, _cloud(memory), newest, unit_of(memory.store))
+    there, surfaces = {i.id: i for i in shown}, memory.surfaces()
+    sheets = {n: s for n, s in surfaces.items() if len(s.faces)}
+    return ShownWorld(there, _cloud(surfaces), sheets, newest, unit_of(memory.store))
 
 
-def _cloud(memory: SceneMemory) -> ShownCloud:
+def _cloud(surfaces: dict[int, Surface]) -> ShownCloud:
     points, rgb, spacing = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)], []
-    surfaces = memory.surfaces()
     for n, surface in surfaces.items():
-        order = np.random.default_rng(n).permutation(len(surface.points))
-        points.append(surface.points[order])
-        rgb.append(surface.rgb[order])
-        spacing.append(point_spacing(surface.points) if len(order) else 0.0)
+        rng = np.random.default_rng(n)
+        if len(surface.faces):
+            on, ink = surface.sampled(_POINTS_A_FACE * len(surface.faces), rng)
+        else:
+            order = rng.permutation(len(surface.vertices))
+            on, ink = surface.vertices[order], surface.rgb[order]
+        points.append(on)
+        rgb.append(ink)
+        spacing.append(point_spacing(on) if len(on) else 0.0)
     counts = np.array([len(p) for p in points[1:]], np.int64)
     return ShownCloud(
         np.concatenate(points), np.concatenate(rgb), np.array(list(surfaces), np.int64), counts, np.array(spacing)
@@ -192,6 +202,13 @@ def colors(world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None
         mine = cloud.owner == selected
         out[mine] = np.round(0.5 * out[mine] + 0.5 * np.array(_SELECTED)).astype(np.uint8)
     return out
+
+
+def sheet_colors(world: ShownWorld, instance_id: int, mode: str) -> NDArray[np.uint8]:
+    """Return the colours of the triangles' corners of an instance. Shape (V, 3)."""
+    rgb = world.sheets[instance_id].rgb
+    only = np.array([instance_id]), np.array([len(rgb)]), np.zeros(1)
+    return colors(world, ShownCloud(world.sheets[instance_id].vertices, rgb, *only), mode, None)
 
 
 def color_of(world: ShownWorld, instance_id: int, mode: str) -> tuple[int, int, int]:

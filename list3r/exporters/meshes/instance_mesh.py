@@ -13,6 +13,7 @@ from list3r.exporters.components import has_box, point_spacing, thinned_support
 from list3r.exporters.meshes.closed import ClosedSurface, divided, filled, hull, outward, slab, zero_level
 from list3r.memory.core.records import Instance, Support
 from list3r.memory.store.store import Store
+from list3r.queries.views.fused import Surface
 
 Array = NDArray[np.float64]
 
@@ -48,13 +49,20 @@ class MeshSettings:
 
 @dataclass(frozen=True)
 class InstanceMesh:
-    """A closed surface with colours, world coordinates."""
+    """A surface with colours, world coordinates; closed, unless it is only what was seen."""
 
     surface: ClosedSurface
     rgb: NDArray[np.uint8]
     """Of vertices, sRGB. Shape (V, 3)."""
     kind: str
-    """reconstructed: follows the points; hull: convex, also on unseen sides; slab: a plane of structure."""
+    """reconstructed: follows the points; hull: convex, also on unseen sides; slab: a plane of structure; seen: fused
+    from depth, open where nothing was seen."""
+
+    @staticmethod
+    def seen(surface: Surface) -> InstanceMesh:
+        """Return triangles that were fused from depth."""
+        vertices, faces = surface.vertices.astype(np.float64), surface.faces.astype(np.int64)
+        return InstanceMesh(ClosedSurface(vertices, faces), surface.rgb, "seen")
 
 
 def instance_mesh(store: Store, instance: Instance, settings: MeshSettings | None = None) -> InstanceMesh | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from list3r.exporters.components import Component, has_box, point_spacing, read_components, thinned_support
-from list3r.exporters.meshes.instance_mesh import instance_mesh
+from list3r.exporters.meshes.instance_mesh import InstanceMesh, instance_mesh
 from list3r.exporters.output import replacing, units
 from list3r.exporters.palette import instance_color, linear_from_srgb
 from list3r.exporters.usd.camera import add_cameras, set_time_range
@@ -25,6 +25,7 @@ from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.core.records import Instance, Support
 from list3r.memory.library.rooms.naming import named_rooms, title
 from list3r.memory.store.store import Store
+from list3r.queries.views.dense import instance_surface
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class UsdSettings:
     points_per_structure: int = 20000
     """At most this many points of a floor, a wall and the like."""
     mesh: bool = False
-    """Whether instances and structure have a closed mesh too; their points are then invisible."""
+    """Whether instances and structure have a mesh too, as it was seen or, to collide, closed; their points are then
+    invisible."""
     colliders: bool = False
     """Whether meshes collide, structure as it is and instances by their convex hull; asks for meshes."""
 
@@ -242,7 +244,8 @@ def _group(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
 
 def _add_surface(stage: Usd.Stage, path: Sdf.Path, instance: Instance, store: Store, settings: UsdSettings) -> None:
     """Add the mesh of an instance in place of its points, where its support allows one."""
-    mesh = instance_mesh(store, instance)
+    seen = None if settings.colliders else instance_surface(store, instance.id)
+    mesh = instance_mesh(store, instance) if seen is None else InstanceMesh.seen(seen)
     if mesh is None:
         return
     box = instance.box

@@ -89,15 +89,15 @@ function hover(id) {
   draw();
 }
 
-// ---------------------------------------------------------------- the points
+// ---------------------------------------------------------------- the surfaces: triangles, or points where there are none
 
-const cloud = data.cloud, count = cloud.kept, low = cloud.low, span = cloud.span;
+const cloud = data.cloud, count = cloud.kept, low = cloud.low, span = cloud.span, after = 12 * cloud.faces;
 const bytes = Uint8Array.from(atob(get("points").textContent), c => c.charCodeAt(0));
-const steps = new Uint16Array(bytes.buffer, 0, 3 * count), ink = bytes.subarray(6 * count);
+const corner = new Uint32Array(bytes.buffer, 0, 3 * cloud.faces), steps = new Uint16Array(bytes.buffer, after, 3 * count), ink = bytes.subarray(after + 6 * count);
 const drawn = new Map();
-let start = 0;
-for (const [id, many, size] of cloud.runs) { drawn.set(id, {start, many, size}); start += many; }
-const gl = canvas.getContext("webgl", {antialias: true});
+let start = 0, face = 0;
+for (const [id, many, size, faces] of cloud.runs) { drawn.set(id, {start, many, size, face, faces}); start += many; face += faces; }
+const gl = canvas.getContext("webgl2", {antialias: true});
 if (!gl) { get("broken").hidden = false; get("broken").textContent = "This browser draws no 3D (WebGL is off); the list works without."; }
 
 function program(vertex, fragment) {
@@ -113,14 +113,15 @@ function program(vertex, fragment) {
     view: at("view"), low: at("low"), span: at("span"), size: at("size"), tint: at("tint"), most: at("most")};
 }
 const buffer = (kind, content) => { const b = gl.createBuffer(); gl.bindBuffer(kind, b); gl.bufferData(kind, content, gl.STATIC_DRAW); return b; };
-const dots = gl && program(
+const [dots, sheets] = gl ? ["if (length(gl_PointCoord - 0.5) > 0.5) discard; ", ""].map(round => program(
   "attribute vec3 place, color; uniform mat4 view; uniform vec3 low; uniform float span, size, most; varying vec3 ink;" +
   "void main() { gl_Position = view * vec4(low + span * place, 1.0); gl_PointSize = clamp(size / gl_Position.w, 1.5, most); ink = color; }",
   "precision mediump float; uniform vec4 tint; varying vec3 ink;" +
-  "void main() { if (length(gl_PointCoord - 0.5) > 0.5) discard; gl_FragColor = vec4(mix(ink, tint.rgb, tint.a), 1.0); }");
+  "void main() { " + round + "gl_FragColor = vec4(mix(ink, tint.rgb, tint.a), 1.0); }")) : [];
 const edges = gl && program("attribute vec3 place; uniform mat4 view; void main() { gl_Position = view * vec4(place, 1.0); }",
   "precision mediump float; uniform vec4 tint; void main() { gl_FragColor = vec4(tint.rgb, 1.0); }");
 const places = gl && buffer(gl.ARRAY_BUFFER, steps), colors = gl && buffer(gl.ARRAY_BUFFER, ink), box = gl && gl.createBuffer();
+const corners = gl && buffer(gl.ELEMENT_ARRAY_BUFFER, corner);
 const EDGES = [...Array(8).keys()].flatMap(a => [1, 2, 4].map(bit => [a, a ^ bit])).filter(([a, b]) => a < b).flat();
 const HUE = [1, 0.78, 0];
 
@@ -163,18 +164,23 @@ function flyTo(i) {
 
 let waits = false;
 function draw() { if (!waits && gl) { waits = true; requestAnimationFrame(() => { waits = false; picture(); }); } }
-function points(view, tint) {
-  gl.useProgram(dots.made);
-  gl.uniformMatrix4fv(dots.view, false, view); gl.uniform3fv(dots.low, low); gl.uniform1f(dots.span, span);
-  gl.uniform1f(dots.most, gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE)[1]);
-  gl.bindBuffer(gl.ARRAY_BUFFER, places); gl.enableVertexAttribArray(dots.place); gl.vertexAttribPointer(dots.place, 3, gl.UNSIGNED_SHORT, true, 0, 0);
-  gl.bindBuffer(gl.ARRAY_BUFFER, colors); gl.enableVertexAttribArray(dots.color); gl.vertexAttribPointer(dots.color, 3, gl.UNSIGNED_BYTE, true, 0, 0);
-  for (const [id, run] of drawn) {
-    gl.uniform1f(dots.size, run.size * 1.7 * canvas.height / 2);
-    gl.uniform4fv(dots.tint, tint(id));
-    gl.drawArrays(gl.POINTS, run.start, run.many);
+function surfaces(view, tint) { // one side only: a room is seen from outside through its walls
+  gl.enable(gl.CULL_FACE);
+  for (const kind of [sheets, dots]) {
+    gl.useProgram(kind.made);
+    gl.uniformMatrix4fv(kind.view, false, view); gl.uniform3fv(kind.low, low); gl.uniform1f(kind.span, span);
+    gl.uniform1f(kind.most, gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE)[1]);
+    gl.bindBuffer(gl.ARRAY_BUFFER, places); gl.enableVertexAttribArray(kind.place); gl.vertexAttribPointer(kind.place, 3, gl.UNSIGNED_SHORT, true, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, colors); gl.enableVertexAttribArray(kind.color); gl.vertexAttribPointer(kind.color, 3, gl.UNSIGNED_BYTE, true, 0, 0);
+    for (const [id, run] of drawn) {
+      if ((kind === sheets) !== run.faces > 0) continue;
+      gl.uniform1f(kind.size, run.size * 1.7 * canvas.height / 2);
+      gl.uniform4fv(kind.tint, tint(id));
+      if (run.faces) gl.drawElements(gl.TRIANGLES, 3 * run.faces, gl.UNSIGNED_INT, 12 * run.face);
+      else gl.drawArrays(gl.POINTS, run.start, run.many);
+    }
+    gl.disableVertexAttribArray(kind.color);
   }
-  gl.disableVertexAttribArray(dots.color);
 }
 function clear(color) {
   gl.viewport(0, 0, canvas.width, canvas.height); gl.enable(gl.DEPTH_TEST);
@@ -186,7 +192,7 @@ function picture() {
   if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
   clear(dark ? [0.09, 0.094, 0.1] : [0.957, 0.957, 0.95]);
   const view = matrix();
-  points(view, id => [...HUE, id === selected ? 0.4 : id === hovered ? 0.2 : 0]);
+  surfaces(view, id => [...HUE, id === selected ? 0.4 : id === hovered ? 0.2 : 0]);
   for (const id of new Set([hovered, selected])) {
     const i = byId.get(id);
     if (!i || !drawn.has(id) || i.corners.some(v => v === null)) continue;
@@ -207,10 +213,10 @@ function picture() {
     }
   }
 }
-function met(event) { // what is under the pointer: the points are drawn with their numbers as colours, and one pixel is read
+function met(event) { // what is under the pointer: the surfaces are drawn with their numbers as colours, and one pixel is read
   const ids = [...drawn.keys()], area = canvas.getBoundingClientRect(), pixel = new Uint8Array(4);
   clear([0, 0, 0]);
-  points(matrix(), id => { const n = ids.indexOf(id) + 1; return [(n & 255) / 255, (n >> 8 & 255) / 255, (n >> 16) / 255, 1]; });
+  surfaces(matrix(), id => { const n = ids.indexOf(id) + 1; return [(n & 255) / 255, (n >> 8 & 255) / 255, (n >> 16) / 255, 1]; });
   const ratio = canvas.width / area.width;
   gl.readPixels((event.clientX - area.left) * ratio, canvas.height - (event.clientY - area.top) * ratio - 1, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
   picture();
@@ -249,7 +255,7 @@ addEventListener("keydown", e => { if (e.key === "Escape") select(null); });
 addEventListener("resize", draw);
 function light() { document.documentElement.classList.toggle("dark", dark); draw(); }
 get("dark").addEventListener("click", () => { dark = !dark; light(); });
-get("facts").textContent = data.lengths + " " + (count < cloud.known ? count.toLocaleString("en") + " of " + cloud.known.toLocaleString("en") + " points are in this file."
-  : "All " + count.toLocaleString("en") + " points are in this file.") + (data.elsewhere ? " " + data.elsewhere + " things lie in parts that are not placed against this one; they are listed, not drawn." : "");
+get("facts").textContent = data.lengths + " " + (count < cloud.known ? count.toLocaleString("en") + " of " + cloud.known.toLocaleString("en") + " points of surfaces are in this file."
+  : "All " + count.toLocaleString("en") + " points of surfaces are in this file.") + (data.elsewhere ? " " + data.elsewhere + " things lie in parts that are not placed against this one; they are listed, not drawn." : "");
 list();
 light();

@@ -18,15 +18,18 @@ from list3r.exporters.output import replacing
 from list3r.exporters.pages import embedded, numbers, thumbnails
 from list3r.memory.core.description.nouns import all_nouns, kinds_of, nouns_of
 from list3r.memory.core.description.printable import shown
+from list3r.queries.views.fused import Surface, fewer
 
 if TYPE_CHECKING:
     from list3r.api import SceneMemory
-    from list3r.memory.core.records import Instance, Support
+    from list3r.memory.core.records import Instance
 
 _STEPS = 65535
 """Places along each side of the scene's box."""
-_POINT_CHARACTERS = 12
-"""Of a point in the page: three numbers of two bytes and three of one, in Base64."""
+_PLACE_CHARACTERS, _FACE_CHARACTERS = 12, 16
+"""In the page, in Base64: of a place three numbers of two bytes and three of one, of a face three of four bytes."""
+_LEAST = 200
+"""Places of a thing that are kept where half of the file has room for them."""
 _LENGTHS = {
     "metric": "Lengths are metres, as a sensor or given poses have them.",
     "anchored": "Lengths are metres, by one length that somebody gave.",
@@ -44,7 +47,7 @@ class WebSettings:
     """Content of a page."""
 
     megabytes: float = 10.0
-    """Size of the file, about; so many points are kept."""
+    """Size of the file, about; so much of the surfaces is kept."""
     crops: int = 500
     """Number of things with a picture, those seen most."""
     crop_px: int = 96
@@ -65,7 +68,7 @@ def write_web(memory: SceneMemory, path: str | Path, settings: WebSettings | Non
         places = {(f.session_id, f.frame_index): S.translation for f, S in memory.camera_poses()}
         main = _main_component(memory)
         drawn = {0, *(i.id for i in instances if i.component == main)}
-        surfaces = {n: s for n, s in memory.surfaces().items() if n in drawn and len(s.points)}
+        surfaces = {n: s for n, s in memory.surfaces().items() if n in drawn and len(s.vertices)}
         data = _about(memory) | {
             "instances": [_instance(i, places.get(_best(i) or (-1, -1))) for i in instances],
             "nouns": _nouns(instances),
@@ -73,7 +76,7 @@ def write_web(memory: SceneMemory, path: str | Path, settings: WebSettings | Non
             "elsewhere": sum(i.component != main for i in instances),
         }
         left = 1e6 * settings.megabytes - len(embedded(data)) - sum(map(len, parts.values()))
-        points, cloud = _points(surfaces, max(int(left / _POINT_CHARACTERS), 1000))
+        points, cloud = _scene(surfaces, max(left, 12_000.0))
         data |= {"cloud": cloud}
         parts |= {"title": html.escape(shown(memory.path.name)), "data": embedded(data), "points": points}
         text = re.sub(r"\{(title|css|js|data|points)\}", lambda found: parts[found[1]], _read("page.html"))
@@ -130,22 +133,26 @@ def _nouns(instances: list[Instance]) -> dict[str, list[str]]:
     return out
 
 
-def _points(surfaces: dict[int, Support], most: int) -> tuple[str, dict[str, Any]]:
-    """Return at most so many points in Base64, places before colours, and what tells how to read them: of each instance
-    its id, how many are its, and how large to draw them. All instances are thinned alike, to a least number.
+def _scene(surfaces: dict[int, Surface], most: float) -> tuple[str, dict[str, Any]]:
+    """Return surfaces in about so many characters of Base64, faces before places before colours, and what tells how to
+    read them: of each instance its id, how many places and faces are its, and how large to draw points without faces.
     """
-    counts = {n: len(s.points) for n, s in surfaces.items()}
-    total = sum(counts.values())
-    share = min(1.0, most / max(total, 1))
-    kept, parts = {n: max(int(c * share), min(c, most // max(2 * len(counts), 1), 200)) for n, c in counts.items()}, []
-    for n, surface in surfaces.items():
-        chosen = np.sort(np.random.default_rng(n).permutation(counts[n])[: kept[n]])
-        size = point_spacing(surface.points) * np.sqrt(counts[n] / max(kept[n], 1))
-        parts.append((n, surface.points[chosen], surface.rgb[chosen], float(size)))
-    xyz = np.concatenate([np.zeros((0, 3), np.float32), *(p for _, p, _, _ in parts)]).astype(np.float64)
-    rgb = np.concatenate([np.zeros((0, 3), np.uint8), *(c for _, _, c, _ in parts)])
+    known = sum(len(s.vertices) for s in surfaces.values())
+    needed = sum(_PLACE_CHARACTERS * len(s.vertices) + _FACE_CHARACTERS * len(s.faces) for s in surfaces.values())
+    share, runs, faces, first = min(1.0, most / max(needed, 1)), [], [np.zeros((0, 3), np.uint32)], 0
+    least = min(_LEAST, most / _PLACE_CHARACTERS / (2 * max(len(surfaces), 1)))
+    parts = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    for n, whole in surfaces.items():
+        s = fewer(whole, max(share, min(1.0, least / len(whole.vertices)))) if share < 1 else whole
+        size = 0.0 if len(s.faces) else 1.5 * point_spacing(s.vertices)
+        runs.append([n, len(s.vertices), round(size, 5), len(s.faces)])
+        parts[0].append(s.vertices.astype(np.float64))
+        parts[1].append(s.rgb)
+        faces.append((s.faces + first).astype("<u4"))
+        first += len(s.vertices)
+    xyz, rgb, corners = np.concatenate(parts[0]), np.concatenate(parts[1]), np.concatenate(faces)
     low, span = (xyz.min(axis=0), float(np.ptp(xyz, axis=0).max()) or 1.0) if len(xyz) else (np.zeros(3), 1.0)
     steps: NDArray[np.uint16] = np.round((xyz - low) / span * _STEPS).astype("<u2")
-    runs = [[n, len(p), round(1.5 * size, 5)] for n, p, _, size in parts]
-    told = {"low": numbers(low, 6), "span": span, "runs": runs, "kept": len(xyz), "known": total}
-    return base64.b64encode(steps.tobytes() + rgb.tobytes()).decode("ascii"), told
+    told = {"low": numbers(low, 6), "span": span, "runs": runs, "kept": len(xyz), "known": known, "faces": len(corners)}
+    content = corners.astype("<u4").tobytes() + steps.tobytes() + rgb.tobytes()
+    return base64.b64encode(content).decode("ascii"), told

@@ -98,6 +98,7 @@ EXTRA_OF_PACKAGE = {
     "lzfse": "record3d",
     "rosbags": "ros",
     "open3d": "open3d",
+    "fast_simplification": "surfaces",
     "pyarrow": "parquet",
     "rerun": "rerun",
     "mcp": "mcp",

@@ -1,39 +1,205 @@
-"""All that is stored of the surfaces of a scene: the support points of instances, and the depth of pictures."""
+"""All that is stored of the surfaces of a scene: triangles where depth can be fused, else points.
+
+What was fused is kept in the user's cache, never beside the memory, under a name that tells all that it came from: what
+chunks measured, where they lie, and what instances are made of. So nothing kept is ever out of date.
+"""
 
 from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import zipfile
+from dataclasses import astuple
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.memory.core.geometry import Sim3
-from list3r.memory.core.masks import decode_mask
-from list3r.memory.core.records import Instance, Support
+from list3r.memory.core.records import Instance
+from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
-from list3r.queries.pictures import KeyframePicture, decode_picture, keyframe_pictures
-from list3r.queries.views.surfaces import inside_box
+from list3r.queries.views.depth_frames import depth_frames
+from list3r.queries.views.fused import FusionSettings, Ints, Surface, can_fuse, fused
 
-REST = 0
-"""Stands for the id of what belongs to no instance."""
-_MOST_PICTURES = 300
-"""Of longer videos so many are taken, evenly: each takes about ten milliseconds."""
+_MOST_FRAMES = 300
+"""Where depth is not fused, points of so many keyframes are taken, evenly."""
 _CELLS = 500
 """Cells along the longest side of the scene; of the points of an instance in one of them the first is kept."""
-_STEP = 0.04
-"""Neighbours whose depth differs by this share lie on two surfaces; what is between them was never seen."""
+_MOST_FILES = 16
+_KEPT_VERTICES = 4_000_000
+"""Files in the cache, and vertices in memory, that are kept."""
+_VERSION = 1
+"""Of what is kept; another one where the same measurements give other triangles."""
 
 
-def dense_surfaces(store: Store) -> dict[int, Support]:
-    """Return the points that are known of each present instance, by id, and under `REST` those of no instance; world
-    coordinates. Where pictures are not kept these are the support points alone.
+def surfaces(store: Store) -> dict[int, Surface]:
+    """Return the surface of each present instance, by id, and under `REST` what is of no instance in the main
+    component; world coordinates.
     """
-    there = {i.id: i for i in store.instances.all() if i.state != "removed" and np.isfinite(i.aabb).all()}
-    out = {n: _finite(store.surfaces.of_instance(i)) for n, i in there.items()}
-    pictures = keyframe_pictures(store)
-    chosen = pictures[:: -(-len(pictures) // _MOST_PICTURES) or 1]
-    seen = [_of_picture(store, p, there) for p in chosen]
-    points, rgb, owner = (np.concatenate(part) for part in zip(_nothing(), *seen, strict=True))
-    if not len(points):
-        return out
+    frames: dict[int, int] = {}
+    for c in store.chunks.all():
+        frames[c.component] = frames.get(c.component, 0) + c.last_frame - c.first_frame
+    out: dict[int, Surface] = {}
+    for component in sorted(frames, key=lambda k: (frames[k], -k)):
+        out |= component_surfaces(store, component)
+    return dict(sorted(out.items()))
+
+
+def component_surfaces(store: Store, component: int) -> dict[int, Surface]:
+    """Return the surface of each present instance of a component, by id, and under `REST` what is of none.
+
+    Triangles where the packages of the extra `surfaces` are installed and stored depth shows it, else points.
+    """
+    there = [i for i in store.instances.all() if i.component == component and _present(i)]
+    seen = fused_surfaces(store, component) if can_fuse() else _points(store, component)
+    return {i.id: _support(store, i) for i in there if i.id not in seen} | seen
+
+
+def instance_surface(store: Store, instance_id: int) -> Surface | None:
+    """Return the triangles that were seen of an instance, world coordinates; open where nothing was seen.
+
+    None where no stored depth shows it where it is now, or the extra `surfaces` is not installed. Raises
+    `UnknownIdError`.
+    """
+    instance = store.instances.get(instance_id)
+    return fused_surfaces(store, instance.component).get(instance.id)
+
+
+def _present(i: Instance) -> bool:
+    return bool(i.state != "removed" and np.isfinite(i.aabb).all())
+
+
+def _support(store: Store, instance: Instance) -> Surface:
+    support = store.surfaces.of_instance(instance)
+    keep = np.isfinite(support.points).all(axis=1)
+    return Surface.of_points(support.points[keep], support.rgb[keep])
+
+
+# ---------------------------------------------------------------------------------------------- triangles
+
+
+class _Kept:
+    """Surfaces by the name of what they came from, and the names of components while the memory stays as it is."""
+
+    def __init__(self) -> None:
+        self.parts: LruCache[str, dict[int, Surface]] = LruCache(
+            _KEPT_VERTICES, lambda parts: sum(len(p.vertices) for p in parts.values())
+        )
+        self._stamp: object = None
+        self._names: dict[int, str] = {}
+
+    def name(self, store: Store, component: int) -> str:
+        """Return the name of what the surface of a component comes from."""
+        if self._stamp != store.connection.stamp():
+            self._stamp, self._names = store.connection.stamp(), {}
+        if component not in self._names:
+            self._names[component] = _name(store, component)
+        return self._names[component]
+
+
+def fused_surfaces(store: Store, component: int) -> dict[int, Surface]:
+    """Return the triangles of each present instance of a component that stored depth shows, by id, and under `REST`
+    those of none, as they are kept or made now; nothing where the extra `surfaces` is not installed.
+    """
+    if not can_fuse():
+        return {}
+    known = store.derived.of(_Kept)
+    name = known.name(store, component)
+    found = known.parts.get(name)
+    if found is not None:
+        return found
+    path = _folder() / f"{name}.npz"
+    read = _read(path)
+    if read is None:
+        whole, owner = fused(store, component)
+        read = _colored(store, component, whole), owner
+        _write(path, *read)
+    return known.parts.put(name, _cut(*read))
+
+
+def _name(store: Store, component: int) -> str:
+    """Return a sum of all that the surface of a component follows from."""
+    told = hashlib.sha256(repr((_VERSION, astuple(FusionSettings()))).encode())
+    sums = store.chunks.checksums()
+    for c in store.chunks.all():
+        if c.component == component:
+            told.update(repr((c.chunk_id, c.session_id, sums[c.chunk_id], store.facts.scale_kind)).encode())
+            told.update(np.asarray(c.S_world_chunk.as_matrix()).tobytes())
+    for o in store.observations.all():
+        told.update(b"%d %d %d;" % (o.instance_id, o.chunk_id, o.local_id))
+    for i in store.instances.all():
+        if i.component == component:
+            told.update(b"%d %d" % (i.id, _present(i)) + i.aabb.tobytes())
+    return told.hexdigest()[:32]
+
+
+def _colored(store: Store, component: int, whole: Surface) -> Surface:
+    """Return the surface of a memory without pictures with the colours of the nearest surface points of instances."""
+    chunks = [c.chunk_id for c in store.chunks.all() if c.component == component]
+    known = [_support(store, i) for i in store.instances.all() if i.component == component and _present(i)]
+    if any(store.keyframes.with_picture(k) for k in chunks) or not any(len(s.vertices) for s in known):
+        return whole
+    from scipy.spatial import cKDTree
+
+    points, rgb = (np.concatenate([getattr(s, name) for s in known]) for name in ("vertices", "rgb"))
+    return Surface(whole.vertices, whole.faces, rgb[cKDTree(points).query(whole.vertices)[1]])
+
+
+def _cut(whole: Surface, owner: Ints) -> dict[int, Surface]:
+    """Return the part of each owner of faces. Shape (F,)."""
+    order = np.argsort(owner, kind="stable")
+    ids, starts = np.unique(owner[order], return_index=True)
+    parts = np.split(whole.faces[order], starts[1:]) if len(ids) else []
+    every = Surface(whole.vertices, np.zeros((0, 3), np.int32), whole.rgb)
+    return {n: every.with_faces(part) for n, part in zip(ids.tolist(), parts, strict=True)}
+
+
+def _folder() -> Path:
+    """Return where surfaces are kept: in `$LIST3R_CACHE`, else in the user's cache."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    return Path(os.environ.get("LIST3R_CACHE") or home / "list3r") / "surfaces"
+
+
+def _read(path: Path) -> tuple[Surface, Ints] | None:
+    """Return what is kept; None where that is nothing, or of no use."""
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        with np.load(path, allow_pickle=False) as held:
+            vertices, faces, rgb, owner = (held[n] for n in ("vertices", "faces", "rgb", "owner"))
+        sound = vertices.shape == rgb.shape and faces.shape == (len(owner), 3) and np.isfinite(vertices).all()
+        if sound and (not len(faces) or (faces.min() >= 0 and faces.max() < len(vertices))):
+            path.touch()
+            return Surface(vertices.astype(np.float32), faces.astype(np.int32), rgb.astype(np.uint8)), owner
+    return None
+
+
+def _write(path: Path, whole: Surface, owner: Ints) -> None:
+    """Keep a surface for the next that opens the memory; where that cannot be, nothing is kept."""
+    new = path.with_suffix(f".{os.getpid()}")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with new.open("wb") as file:
+            np.savez_compressed(file, vertices=whole.vertices, faces=whole.faces, rgb=whole.rgb, owner=owner)
+        new.replace(path)
+        for old in sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)[:-_MOST_FILES]:
+            old.unlink()
+
+
+# ---------------------------------------------------------------------------------------------- points
+
+
+def _points(store: Store, component: int) -> dict[int, Surface]:
+    """Return the points that pictures show of each instance, with its surface points, and under `REST` of none."""
+    chunks = [c for c in store.chunks.all() if c.component == component]
+    count = sum(len(store.keyframes.with_picture(c.chunk_id)) for c in chunks)
+    parts: list[tuple[NDArray[np.float32], NDArray[np.uint8], Ints]] = []
+    for f in depth_frames(store, component, every=-(-count // _MOST_FRAMES) or 1):
+        if f.jpeg:
+            seen = f.on_one_surface()
+            parts.append((f.points()[seen].astype(np.float32), f.colors()[seen], f.owner[seen]))
+    if not sum(len(p) for p, _, _ in parts):
+        return {}
+    points, rgb, owner = (np.concatenate(part) for part in zip(*parts, strict=True))
     low, high = np.quantile(points, [0.01, 0.99], axis=0)  # depth far off is rare
     cell = np.floor((points - low) / max(float((high - low).max()) / _CELLS, 1e-9)).astype(np.int64)
     near = (np.abs(cell) < 2 * _CELLS).all(axis=1)
@@ -42,59 +208,9 @@ def dense_surfaces(store: Store) -> dict[int, Support]:
     kept = np.flatnonzero(near)[np.sort(first)]
     kept = kept[np.argsort(owner[kept], kind="stable")]
     ids, starts = np.unique(owner[kept], return_index=True)
+    known = {i.id: _support(store, i) for i in store.instances.all() if i.id in ids}
+    out = {}
     for n, part in zip(ids.tolist(), np.split(kept, starts[1:]), strict=True):
-        known = out.get(n, Support(*_nothing()[:1], np.zeros(0, np.float32), np.zeros((0, 3), np.uint8)))
-        out[n] = Support(
-            np.concatenate([known.points, points[part]]),
-            np.concatenate([known.confidence, np.ones(len(part), np.float32)]),
-            np.concatenate([known.rgb, rgb[part]]),
-        )
+        has = known.get(n, Surface.of_points(points[:0], rgb[:0]))
+        out[n] = Surface.of_points(np.concatenate([has.vertices, points[part]]), np.concatenate([has.rgb, rgb[part]]))
     return out
-
-
-Points = tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]
-"""World (N, 3), colours (N, 3), ids of instances (N,)."""
-
-
-def _nothing() -> Points:
-    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)
-
-
-def _finite(support: Support) -> Support:
-    keep = np.isfinite(support.points).all(axis=1)
-    return Support(support.points[keep], support.confidence[keep], support.rgb[keep])
-
-
-def _of_picture(store: Store, picture: KeyframePicture, there: dict[int, Instance]) -> Points:
-    """Return what one picture shows. Of an instance only what lies where it is now: it may have moved since."""
-    keyframe = store.keyframes.get(picture.chunk_id, picture.frame_index)
-    depth, (fx, fy, cx, cy) = keyframe.depth_small.astype(np.float64), keyframe.camera_small
-    if not depth.any():
-        return _nothing()
-    rows, columns = np.nonzero(_on_one_surface(depth))
-    z = depth[rows, columns]
-    local = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
-    S_world_cam = store.chunks.get(picture.chunk_id).S_world_chunk @ Sim3.from_matrix(keyframe.T_chunk_cam)
-    points, image = S_world_cam.apply(local), decode_picture(keyframe.jpeg)
-    rgb = image[_at(rows, depth.shape[0], image.shape[0]), _at(columns, depth.shape[1], image.shape[1])]
-    height, width = picture.image_size
-    v, u = _at(rows, depth.shape[0], height), _at(columns, depth.shape[1], width)
-    owner, keep = np.full(len(z), REST), np.ones(len(z), bool)
-    for sight in sorted(picture.sights, key=lambda s: -s.area_px):  # what is smaller lies before what is larger
-        owner[decode_mask(sight.mask, (height, width))[v, u]] = sight.instance_id
-    for n in np.setdiff1d(owner, REST).tolist():
-        mine = np.flatnonzero(owner == n)
-        keep[mine] = inside_box(points[mine], there[n]) if n in there else False
-    return points[keep].astype(np.float32), rgb[keep], owner[keep]
-
-
-def _at(index: NDArray[np.int64], of: int, to: int) -> NDArray[np.int64]:
-    """The pixels of a picture of `to` rows at rows of one of `of`."""
-    return np.minimum(((index + 0.5) * to / of).astype(np.int64), to - 1)
-
-
-def _on_one_surface(depth: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which pixels have depth that their four neighbours share. Shape (h, w)."""
-    around = np.pad(depth, 1, mode="edge")
-    beside = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
-    return np.asarray((depth > 0) & np.all([np.abs(n - depth) < _STEP * depth for n in beside], axis=0))
