@@ -21,8 +21,6 @@ from list3r.memory.core.geometry import Array
 
 Cells = NDArray[np.int64]
 
-_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-
 
 @dataclass(frozen=True)
 class ConvexSettings:
@@ -82,15 +80,21 @@ class _Piece:
 
 
 def _outer_corners(cells: Cells) -> Cells:
-    """Return the corners of the first and last voxel of each column along the axis that has fewest of them."""
-    ends = []
-    for axis in range(3):
-        rest = [k for k in range(3) if k != axis]
-        order = np.lexsort((cells[:, axis], cells[:, rest[0]], cells[:, rest[1]]))
-        new = (np.diff(cells[order][:, rest], axis=0) != 0).any(axis=1)
-        ends.append(np.unique(np.concatenate([order[:1], order[1:][new], order[:-1][new], order[-1:]])))
-    outer = cells[min(ends, key=len)]
-    return np.asarray(np.unique((outer[:, None] + _CORNERS).reshape(-1, 3), axis=0))
+    """Return the first and last corner of voxels along their shortest axis, all that their hull needs. (M, 3)."""
+    low = cells.min(axis=0)
+    count = cells.max(axis=0) - low + 1
+    rest = np.sort(np.argsort(count, kind="stable")[1:])
+    axis = 3 - int(rest.sum())
+    first = np.full(tuple(count[rest] + 1), count[axis] + 1)
+    last = np.full(first.shape, -1)
+    x, y = (cells[:, rest] - low[rest]).T
+    z = cells[:, axis] - low[axis]
+    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        np.minimum.at(first, (x + dx, y + dy), z)
+        np.maximum.at(last, (x + dx, y + dy), z + 1)
+    at = np.argwhere(last > 0)
+    ends = [np.insert(at, axis, heights[tuple(at.T)], axis=1) for heights in (first, last)]
+    return np.asarray(np.concatenate(ends) + low)
 
 
 def _connected(cells: Cells) -> list[Cells]:
@@ -99,10 +103,13 @@ def _connected(cells: Cells) -> list[Cells]:
         return []
     low = cells.min(axis=0)
     mask = np.zeros(tuple(cells.max(axis=0) - low + 1), bool)
-    mask[tuple((cells - low).T)] = True
+    at = tuple((cells - low).T)
+    mask[at] = True
     parts, count = ndimage.label(mask)
-    which = parts[tuple((cells - low).T)]
-    return [cells[which == n] for n in range(1, count + 1) if (which == n).sum() >= 8] or [cells]
+    if count == 1:
+        return [cells]
+    which = parts[at]
+    return [cells[which == n] for n in np.flatnonzero(np.bincount(which) >= 8)] or [cells]
 
 
 def _cut(piece: _Piece, room: int, s: ConvexSettings) -> list[_Piece]:

@@ -32,6 +32,8 @@ _AROUND_M = 0.1
 """Neighbours are so near."""
 _STANDS_M = 0.25
 """What it stands on lies at most so far from the lowest that was seen of an instance."""
+_INTO_M = 0.05
+"""And at most so far above that."""
 _CHUNKS = 64
 """Whose depth pictures are kept in memory."""
 _LEAST_UNDER = 20
@@ -106,8 +108,9 @@ class Solids:
         points = thinned_support(self._store, under, _OTHERS).points
         here = ((points[:, :2] > instance.aabb[0, :2]) & (points[:, :2] < instance.aabb[1, :2])).all(axis=1)
         heights = points[here if here.sum() >= _LEAST_UNDER else slice(None), 2]
-        heights = heights[np.abs(heights - lowest) < _STANDS_M * self._metre]
-        return float(np.median(heights)) if len(heights) else lowest
+        below = (lowest - heights) / self._metre
+        heights = heights[(below < _STANDS_M) & (below > -_INTO_M)]
+        return float(np.quantile(heights, 0.9)) if len(heights) else lowest
 
 
 def solid_of(instance: Instance, around: Surroundings) -> Solid | None:
