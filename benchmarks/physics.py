@@ -3,8 +3,8 @@
 python benchmarks/physics.py --seeds 971-980 --keep FOLDER --json benchmarks/results/physics.json
 
 Two furnished rooms a world, every third frame of the walk, built with given poses. Each true thing is tried alone,
-fixed on a floor, in three forms: `true` of its own parts, `hull` as colliders were before, `ours` of `export --to mjcf`.
-A ball of 5 cm is dropped into each open container from 10 cm above its rim (after 4 s it must be in it), rolled at
+fixed on a floor, three times: `true` of its own parts, `hull` as colliders were before, `ours` of `export --to
+mjcf`. A ball of 5 cm is dropped into each open container from 10 cm above its rim (in it after 4 s), rolled at
 1 m/s under each table from front to back (in 4 s it must come out), and put on each seat, table top and board (after
 3 s it must be within 5 cm in height and 15 cm aside). Things for which the memory has no instance with a box IoU of
 0.25 are not found. `rest` is the whole scene for 10 s: a body explodes where it exceeds 5 m/s or ends farther than 1 m

@@ -141,6 +141,7 @@ def test_a_model_for_mujoco_has_bodies_with_mass_on_fixed_structure(tmp_path: Pa
     path = tmp_path / "room.l3r"
     with Store.create(path) as store, store.transaction():
         write_small_room(store)
+        store.connection.execute("DELETE FROM keyframes")  # their depth is of another room
     for density in (None, 400.0):
         with list3r.open(path) as memory:
             files = memory.export("mjcf", tmp_path / "sim", density=density)

@@ -26,6 +26,10 @@ _SEEN_CELLS = 1.5
 """A vertex so near a surface point was seen."""
 _HALF_SHELL_CELLS = 0.3
 """Of a shell that was seen from both sides, so that it keeps a thickness."""
+_CARRIED_CELLS = 12.0
+"""A seen surface is carried on so far into gaps."""
+_TURN_CELLS = 8.0
+"""A turn of a radian counts as so many cells."""
 _OTHERS = 4000
 """Points of each neighbour that are looked at."""
 _AROUND_M = 0.1
@@ -160,7 +164,7 @@ def _surface(
     seen = near & before
     keep = np.where(behind, _HALF_SHELL_CELLS, 0.0)
     shift = np.clip(np.einsum("ij,ij->i", middle - vertices, normals) + keep, -1.0, 1.0)
-    moved = vertices + np.where(seen, shift, 0.0)[:, None] * normals
+    moved = vertices + _carried_on(vertices, normals, seen, shift)[:, None] * normals
     at = {tuple(c): n for n, c in enumerate(corners.tolist())}
 
     def place(cells: NDArray[np.int64]) -> Array:
@@ -172,6 +176,22 @@ def _surface(
         return e.world(places)
 
     return ClosedSurface(e.world(moved), surface.faces), seen[surface.faces].all(axis=1), place
+
+
+def _carried_on(vertices: Array, normals: Array, seen: NDArray[np.bool_], shift: Array) -> Array:
+    """Return shifts of vertices: of those that were not seen, that of seen ones near them on the same side and level,
+    else none.
+    """
+    out = np.where(seen, shift, 0.0)
+    if not seen.any() or seen.all():
+        return out
+    weighted = np.concatenate([vertices, _TURN_CELLS * normals], axis=1)
+    away, which = cKDTree(weighted[seen]).query(weighted[~seen], k=4, distance_upper_bound=_CARRIED_CELLS)
+    which = np.flatnonzero(seen)[np.minimum(which, seen.sum() - 1)]
+    level = np.einsum("nkj,nj->nk", vertices[which] - vertices[~seen][:, None], normals[~seen])
+    weight = np.where(np.isfinite(away) & (np.abs(level) < 1.0), 1.0, 0.0)
+    out[~seen] = (weight * shift[which]).sum(axis=1) / np.maximum(weight.sum(axis=1), 1.0)
+    return out
 
 
 def _is_free(free: Mask, places: Array, step: Array) -> NDArray[np.bool_]:
