@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 
 from tables.association import alignment, changed, fair, kitchen, methods, registration, returns, worth
-from tables.exports import batches, catalogue, exports, pack, receivers
+from tables.exports import batches, catalogue, exports, pack, physics, receivers
 from tables.lighter import derivation
 from tables.results import ROOT
 from tables.summary import summary
@@ -39,6 +39,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "pack": pack,
     "exports": exports,
     "receivers": receivers,
+    "physics": physics,
     "catalogue": catalogue,
     "batches": batches,
 }

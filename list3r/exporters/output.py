@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from list3r.memory.core.errors import ExportError
+from list3r.memory.core.errors import ExportError, OptionError
+from list3r.memory.library.world.scale import lengths_of
 
 if TYPE_CHECKING:
     from list3r.memory.store.store import Store
@@ -151,3 +152,19 @@ def units(store: Store) -> str:
     """Return the unit of length: "m" for a metric or anchored memory, "unit" for a relative one (arbitrary scale) and a
     guessed one (about a metre)."""
     return "m" if store.facts.scale_kind in ("metric", "anchored") else "unit"
+
+
+def check_metre(store: Store, *, guessed: bool) -> None:
+    """Raise `OptionError` for a memory without metric scale; where the metre is guessed, unless that is taken."""
+    known = lengths_of(store).metric == "guessed"
+    if units(store) != "m" and not (known and guessed):
+        raise OptionError(
+            f"{store.path.name} has no metric scale, which a simulator needs: `list3r edit scale --anchor` gives it one"
+            + (", --guessed-metre takes the guess" if known else "")
+        )
+
+
+def check_density(density: float | None) -> None:
+    """Raise `OptionError` for a density, kg per cubic metre, that nothing has."""
+    if density is not None and not 0 < density < 1e6:
+        raise OptionError(f"density {density:g}: give kilograms per cubic metre, such as 300")

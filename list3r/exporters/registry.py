@@ -29,6 +29,7 @@ class ExportOptions(TypedDict, total=False):
     colliders: bool | None
     density: float | None
     ids: tuple[int, ...] | None
+    guessed_metre: bool | None
     workers: int | None
     progress: Callable[[int, int], None] | None
 
@@ -99,8 +100,16 @@ FORMATS: dict[str, Format] = {
         (),
         "a prop for each instance and a scene of them, for simulators",
         settings="SimreadySettings",
-        options=("density", "ids", "workers", "progress"),
+        options=("density", "ids", "guessed_metre", "workers", "progress"),
         address_space_mb=USD_MB,
+    ),
+    "mjcf": Format(
+        "mjcf",
+        "write_mjcf",
+        (),
+        "a model for MuJoCo: things as bodies on fixed structure",
+        settings="MjcfSettings",
+        options=("density", "guessed_metre"),
     ),
     "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),
     "nerfstudio": Format("cameras.nerfstudio", "write_nerfstudio", (), "transforms.json with pictures"),

@@ -49,6 +49,30 @@ def receivers() -> str:
     return table(["memory", *heads], rows)
 
 
+def physics() -> str:
+    """Return what balls do at things, and scenes at rest, in a physics engine."""
+    total = read("physics")["total"]
+    names = {"in": "dropped into containers, stays", "under": "rolled under tables, comes out", "on": "put on, stays"}
+    rows = [
+        [
+            name,
+            str(r["tried"]),
+            str(r["found"]),
+            f"{r['true']} of {r['tried']}",
+            *(f"{r[k]} of {r['found']}" for k in ("hull", "ours")),
+        ]
+        for key, name in names.items()
+        for r in (total[key],)
+    ]
+    for key, name in (
+        ("exploded", "10 s at rest: bodies that explode"),
+        ("stayed", "bodies within 5 cm of where they were"),
+    ):
+        some = [total[f"rest {k}"] for k in ("true", "hull", "ours")]
+        rows.append([name, "", "", *(f"{r[key]} of {r['bodies']}" for r in some)])
+    return table(["ball of 5 cm", "things", "found", "true shapes", "hulls", "solids"], rows)
+
+
 def catalogue() -> str:
     """Return what questions to a catalogue in PostgreSQL cost as it grows."""
     stages = read("catalog")["stages"]

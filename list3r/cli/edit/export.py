@@ -63,7 +63,7 @@ def export(
     density: Annotated[
         float | None,
         typer.Option(
-            "--density", metavar="KG/M3", help="simready: kg per cubic metre of the hull, for an estimated mass."
+            "--density", metavar="KG/M3", help="simready, mjcf: kg per cubic metre of the hull, for an estimated mass."
         ),
     ] = None,
     ids: Annotated[
@@ -73,7 +73,7 @@ def export(
         bool,
         typer.Option(
             "--guessed-metre",
-            help="simready: take a guessed metre for one; lengths and masses are as wrong as it.",
+            help="simready, mjcf: take a guessed metre for one; lengths and masses are as wrong as it.",
         ),
     ] = False,
     workers: Annotated[

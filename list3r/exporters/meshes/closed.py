@@ -162,13 +162,60 @@ def slab(cells: NDArray[np.bool_]) -> ClosedSurface:
 
 def _without_corner_contacts(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     cells = cells.copy()
+    _join_corners(cells)
+    return cells
+
+
+def _join_corners(cells: NDArray[np.bool_]) -> None:
+    """Join cells that touch at a corner alone, in place."""
+    a, b, c, d = cells[:-1, :-1], cells[1:, :-1], cells[1:, 1:], cells[:-1, 1:]
     while True:
-        a, b, c, d = cells[:-1, :-1], cells[1:, :-1], cells[1:, 1:], cells[:-1, 1:]
         one, other = a & c & ~b & ~d, b & d & ~a & ~c
         if not (one.any() or other.any()):
-            return cells
-        cells[1:, :-1] |= one
-        cells[:-1, :-1] |= other
+            return
+        b |= one
+        a |= other
+
+
+def net(cells: NDArray[np.bool_]) -> tuple[ClosedSurface, NDArray[np.int64]]:
+    """Return the surface of occupied cells, in steps of the grid from the middle of the first one, and its vertices'
+    corners: a vertex for each corner of the cells that lies on the surface, at the middle of the sides that it joins
+    (surface nets, Gibson 1998). A corner is named by the cell above it in all axes.
+
+    Cells that touch along an edge alone are joined by one more, so that no edge has four faces. Shape (X, Y, Z).
+    """
+    cells = np.pad(cells, 2)
+    while True:
+        before = int(cells.sum())
+        for axis in range(3):
+            for layer in np.moveaxis(cells, axis, 0):
+                _join_corners(layer)
+        if int(cells.sum()) == before:
+            break
+    shape = tuple(n - 1 for n in cells.shape)  # of corners, each between eight cells
+    sums, weights = np.zeros((*shape, 3)), np.zeros(shape)
+    quads = []
+    number = np.arange(int(np.prod(shape))).reshape(shape)
+    for axis in range(3):
+        at = np.moveaxis(cells, axis, 0)
+        corner = np.moveaxis(number, axis, 0)
+        for inside in (0, 1):
+            face = np.argwhere(at[inside : len(at) - 1 + inside] & ~at[1 - inside : len(at) - inside])
+            around = [corner[face[:, 0], face[:, 1] + dy - 1, face[:, 2] + dz - 1] for dy, dz in _RING]
+            middle = np.insert(face[:, 1:].astype(float), axis, face[:, 0] + 0.5, axis=1)
+            for ring in around:
+                np.add.at(sums.reshape(-1, 3), ring, middle)
+                np.add.at(weights.reshape(-1), ring, 1.0)
+            turned = (inside == 1) != (axis == 1)
+            quads.append(np.stack(around[::-1] if turned else around, axis=1))
+    ring = np.concatenate(quads)
+    used, faces = np.unique(np.concatenate([ring[:, [0, 1, 2]], ring[:, [0, 2, 3]]]), return_inverse=True)
+    vertices = sums.reshape(-1, 3)[used] / weights.reshape(-1)[used, None]
+    corners = np.stack(np.unravel_index(used, shape), axis=1) - 1
+    return ClosedSurface(vertices - 2, faces.reshape(-1, 3).astype(np.int64)), corners
+
+
+_RING = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 
 def filled(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:

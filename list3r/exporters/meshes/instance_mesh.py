@@ -75,7 +75,7 @@ def mesh_of(instance: Instance, support: Support, settings: MeshSettings | None 
     """Return the mesh of surface points that were read, None where they allow none."""
     s = settings or MeshSettings()
     points = support.points.astype(np.float64)
-    points = points[_dense(points)]
+    points = points[dense(points)]
     if len(points) < s.least_points or not np.ptp(points, axis=0).max() > 0:
         return None
     if instance.structure is not None and has_box(instance):
@@ -91,7 +91,7 @@ def mesh_of(instance: Instance, support: Support, settings: MeshSettings | None 
     return InstanceMesh(surface, np.round(rgb).astype(np.uint8), kind)
 
 
-def _dense(points: Array) -> NDArray[np.bool_]:
+def dense(points: Array) -> NDArray[np.bool_]:
     """Return which points have neighbours as near as usual: outliers would distort a hull."""
     if len(points) < 10:
         return np.ones(len(points), bool)

@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from list3r.exporters.components import has_box, read_components
 from list3r.exporters.meshes.instance_mesh import InstanceMesh, instance_mesh
-from list3r.exporters.output import replacing_folder, units
+from list3r.exporters.output import check_density, check_metre, replacing_folder
 from list3r.exporters.simready.processes import Making, write_props
 from list3r.exporters.simready.prop import Prop, PropFacts
 from list3r.exporters.usd.labels import set_labels
@@ -21,7 +21,6 @@ from list3r.exporters.usd.stage import errors_of_disk
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.core.records import Instance
-from list3r.memory.library.world.scale import lengths_of
 from list3r.memory.store.store import Store
 
 
@@ -43,8 +42,7 @@ class SimreadySettings:
     """Of more props than this a thousand ids share a folder, `from_12000`."""
 
     def __post_init__(self) -> None:
-        if self.density is not None and not 0 < self.density < 1e6:
-            raise OptionError(f"density {self.density:g}: give kilograms per cubic metre, such as 300")
+        check_density(self.density)
         if self.workers is not None and self.workers < 0:
             raise OptionError(f"workers {self.workers}: give the number of worker processes, 0 for none")
 
@@ -58,12 +56,7 @@ def write_simready(store: Store, folder: str | Path, settings: SimreadySettings 
     without a prop.
     """
     folder, settings = Path(folder), settings or SimreadySettings()
-    guessed = lengths_of(store).metric == "guessed"
-    if units(store) != "m" and not (guessed and settings.guessed_metre):
-        raise OptionError(
-            f"{store.path.name} has no metric scale, which a simulator needs: `list3r edit scale --anchor` gives it one"
-            + (", --guessed-metre takes the guess" if guessed else "")
-        )
+    check_metre(store, guessed=settings.guessed_metre)
     objects, structure = _chosen(store, settings)
     parts = len(objects) > settings.one_folder
     facts = PropFacts(datetime.date.today().isoformat(), store.path.name, settings.density, parts)

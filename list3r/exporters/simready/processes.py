@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from list3r.exporters.components import thinned_support
-from list3r.exporters.meshes.instance_mesh import MeshSettings, mesh_of
 from list3r.exporters.simready.prop import Prop, PropFacts, write_prop
-from list3r.memory.core.records import Instance, Support
+from list3r.exporters.solids.solid import Solids, Surroundings, solid_of
+from list3r.memory.core.records import Instance
 from list3r.memory.store.store import Store
 from list3r.pipeline.workers import OrderedPool, default_workers
 
-Some = Sequence[tuple[Instance, Support]]
+Some = Sequence[tuple[Instance, Surroundings]]
 _AT_ONCE = 50
 """Instances that a process makes at a time; of fewer than four times as many no process is started unasked."""
 
@@ -32,7 +31,8 @@ class Making:
 def write_props(store: Store, shown: Sequence[Instance], folder: Path, facts: PropFacts, making: Making) -> list[Prop]:
     """Write a prop below `folder` for each instance with enough points for a mesh; in their order."""
     blocks = [shown[n : n + _AT_ONCE] for n in range(0, len(shown), _AT_ONCE)]
-    some = ([(i, thinned_support(store, i, MeshSettings().points)) for i in block] for block in blocks)
+    solids = Solids(store)
+    some = ([(i, solids.around(i)) for i in block] for block in blocks)
     workers = making.workers if making.workers is not None else default_workers() if len(blocks) >= 4 else 0
     props, done = [], 0
     for block, made in zip(blocks, _made(some, partial(_write_some, folder, facts), workers), strict=True):
@@ -53,5 +53,5 @@ def _made(some: Iterator[Some], work: Callable[[Some], list[Prop]], workers: int
 
 def _write_some(folder: Path, facts: PropFacts, some: Some) -> list[Prop]:
     """Write the props of some instances, in the process that makes them."""
-    meshes = ((i, mesh_of(i, support)) for i, support in some)
-    return [write_prop(folder, i, mesh, facts) for i, mesh in meshes if mesh is not None]
+    solids = ((i, solid_of(i, around)) for i, around in some)
+    return [write_prop(folder, i, solid, facts) for i, solid in solids if solid is not None]

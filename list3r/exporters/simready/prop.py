@@ -15,8 +15,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 from list3r.exporters.meshes.closed import hull
 from list3r.exporters.meshes.instance_mesh import InstanceMesh
 from list3r.exporters.simready.thumbnail import thumbnail
+from list3r.exporters.solids.solid import Solid
 from list3r.exporters.usd.labels import class_token, set_labels
-from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind
+from list3r.exporters.usd.mesh import add_solid, add_vertex_material, bind
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import Instance
 
@@ -52,14 +53,14 @@ class Prop:
     T_world_prop: Sim3
 
 
-def write_prop(folder: Path, instance: Instance, mesh: InstanceMesh, facts: PropFacts) -> Prop:
+def write_prop(folder: Path, instance: Instance, solid: Solid, facts: PropFacts) -> Prop:
     """Write `NAME/simready_usd/NAME.usd` with its thumbnail below the folder of the export, or of its part."""
-    name = prop_name(instance)
+    name, mesh = prop_name(instance), solid.mesh
     T_world_prop = _base(instance, mesh)
     place = folder / facts.part(instance.id) / name / "simready_usd"
     thumbs = place / ".thumbs" / "256x256"
     thumbs.mkdir(parents=True)
-    stage = _stage(name, instance, mesh, T_world_prop, facts)
+    stage = _stage(name, instance, solid, T_world_prop, facts)
     file = place / f"{name}.usd"
     if not stage.GetRootLayer().Export(str(file)):
         raise OSError(f"{file} cannot be written")
@@ -84,7 +85,7 @@ def _base(instance: Instance, mesh: InstanceMesh) -> Sim3:
     return Sim3(np.ones(()), rotation, rotation @ origin)
 
 
-def _stage(name: str, instance: Instance, mesh: InstanceMesh, T_world_prop: Sim3, facts: PropFacts) -> Usd.Stage:
+def _stage(name: str, instance: Instance, solid: Solid, T_world_prop: Sim3, facts: PropFacts) -> Usd.Stage:
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -97,16 +98,15 @@ def _stage(name: str, instance: Instance, mesh: InstanceMesh, T_world_prop: Sim3
     root.CreateAttribute("list3r:id", Sdf.ValueTypeNames.Int, custom=True).Set(instance.id)
     UsdGeom.Scope.Define(stage, root.GetPath().AppendChild("Looks"))
     material = add_vertex_material(stage, root.GetPath().AppendPath("Looks/seen"))
-    body = add_mesh(stage, root.GetPath().AppendChild("mesh"), mesh, T_world_prop)
+    body = add_solid(stage, root.GetPath(), solid, T_world_prop)
     bind(body.GetPrim(), material)
-    add_collider(body, fixed=False)
-    convex = mesh.surface if mesh.kind == "hull" or facts.density_kg_m3 is None else hull(mesh.surface.vertices)
-    mass = None if facts.density_kg_m3 is None else facts.density_kg_m3 * convex.volume()
+    density = facts.density_kg_m3
+    mass = None if density is None else density * hull(solid.mesh.surface.vertices).volume()
     if mass is not None:
         UsdPhysics.RigidBodyAPI.Apply(root)
         UsdPhysics.MassAPI.Apply(root).CreateMassAttr(mass)
         root.CreateAttribute("list3r:mass:estimated", Sdf.ValueTypeNames.Bool, custom=True).Set(True)
-        root.CreateAttribute("list3r:mass:density", Sdf.ValueTypeNames.Double, custom=True).Set(facts.density_kg_m3)
+        root.CreateAttribute("list3r:mass:density", Sdf.ValueTypeNames.Double, custom=True).Set(density)
     extents = np.ptp(np.asarray(body.GetPointsAttr().Get()), axis=0)
     metadata = {
         "author": "list3r",

@@ -6,18 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
+from list3r.exporters.meshes.closed import ClosedSurface
 from list3r.exporters.meshes.instance_mesh import InstanceMesh
 from list3r.exporters.palette import linear_from_srgb
+from list3r.exporters.solids.solid import Solid
 from list3r.exporters.usd.labels import set_token
 from list3r.memory.core.geometry import Sim3
 
 
 def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: InstanceMesh, T_world_prim: Sim3) -> UsdGeom.Mesh:
     """Add a mesh in the frame of its parent prim, with its kind as `list3r:surface`."""
+    prim = _add_surface(stage, path, mesh.surface, T_world_prim)
+    set_vertex_colors(prim, mesh.rgb)
+    prim.GetPrim().CreateAttribute("list3r:surface", Sdf.ValueTypeNames.Token, custom=True).Set(mesh.kind)
+    return prim
+
+
+def _add_surface(stage: Usd.Stage, path: Sdf.Path, surface: ClosedSurface, T_world_prim: Sim3) -> UsdGeom.Mesh:
     prim = UsdGeom.Mesh.Define(stage, path)
-    local = np.ascontiguousarray(T_world_prim.inverse().apply(mesh.surface.vertices), dtype=np.float32)
-    normals = mesh.surface.normals() @ T_world_prim.rotation
-    faces = np.ascontiguousarray(mesh.surface.faces, dtype=np.int32)
+    local = np.ascontiguousarray(T_world_prim.inverse().apply(surface.vertices), dtype=np.float32)
+    normals = surface.normals() @ T_world_prim.rotation
+    faces = np.ascontiguousarray(surface.faces, dtype=np.int32)
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(local))
     prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
     prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
@@ -25,8 +34,6 @@ def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: InstanceMesh, T_world_prim:
     prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateExtentAttr([Gf.Vec3f(*v.tolist()) for v in (local.min(axis=0), local.max(axis=0))])
-    set_vertex_colors(prim, mesh.rgb)
-    prim.GetPrim().CreateAttribute("list3r:surface", Sdf.ValueTypeNames.Token, custom=True).Set(mesh.kind)
     return prim
 
 
@@ -63,6 +70,19 @@ def add_vertex_material(stage: Usd.Stage, path: Sdf.Path) -> UsdShade.Material:
 def bind(prim: Usd.Prim, material: UsdShade.Material) -> None:
     """Bind a material to a prim and its children."""
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+
+
+def add_solid(stage: Usd.Stage, path: Sdf.Path, solid: Solid, T_world_prim: Sim3) -> UsdGeom.Mesh:
+    """Add `mesh`, with `primvars:list3r:seen` for each face, and below `colliders` the convex parts that collide."""
+    prim = add_mesh(stage, path.AppendChild("mesh"), solid.mesh, T_world_prim)
+    seen = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("list3r:seen", Sdf.ValueTypeNames.BoolArray, UsdGeom.Tokens.uniform)
+    seen.Set(Vt.BoolArray.FromNumpy(solid.seen))
+    group = UsdGeom.Xform.Define(stage, path.AppendChild("colliders")).GetPath()
+    for n, part in enumerate(solid.parts):
+        shape = _add_surface(stage, group.AppendChild(f"part_{n}"), part, T_world_prim)
+        shape.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        add_collider(shape, fixed=False)
+    return prim
 
 
 def add_collider(mesh: UsdGeom.Mesh, *, fixed: bool) -> None:

@@ -17,9 +17,10 @@ from list3r.exporters.components import Component, has_box, point_spacing, read_
 from list3r.exporters.meshes.instance_mesh import InstanceMesh, instance_mesh
 from list3r.exporters.output import replacing, units
 from list3r.exporters.palette import instance_color, linear_from_srgb
+from list3r.exporters.solids.solid import Solids
 from list3r.exporters.usd.camera import add_cameras, set_time_range
 from list3r.exporters.usd.labels import class_token, set_labels
-from list3r.exporters.usd.mesh import add_collider, add_mesh, add_vertex_material, bind, set_vertex_colors
+from list3r.exporters.usd.mesh import add_collider, add_mesh, add_solid, add_vertex_material, bind, set_vertex_colors
 from list3r.memory.core.errors import ExportError, OptionError
 from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation
 from list3r.memory.core.records import Instance, Support
@@ -40,7 +41,7 @@ class UsdSettings:
     """Whether instances and structure have a mesh too, as it was seen or, to collide, closed; their points are then
     invisible."""
     colliders: bool = False
-    """Whether meshes collide, structure as it is and instances by their convex hull; asks for meshes."""
+    """Whether meshes collide, structure as it is and instances by the convex parts of their solids; asks for meshes."""
 
     def __post_init__(self) -> None:
         if min(self.points_per_instance, self.points_per_structure) < 0:
@@ -101,11 +102,12 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
     stage = Usd.Stage.CreateInMemory()
     world = _prepare(stage, store)
     paths: dict[int, Sdf.Path] = {}
+    solids = Solids(store) if settings.colliders else None
     for component in components:
         scope = world if component.main else _component_scope(stage, component)
         for start in range(0, len(component.instances), _TOGETHER):
             several = component.instances[start : start + _TOGETHER]
-            paths |= _add_together(stage, scope.GetPath(), several, store, settings)
+            paths |= _add_together(stage, scope.GetPath(), several, store, settings, solids)
         add_cameras(stage, scope.GetPath(), component)
         if component.id == min(c.id for c in components):
             _add_rooms(stage, scope.GetPath(), store, paths)
@@ -179,14 +181,19 @@ def _component_scope(stage: Usd.Stage, component: Component) -> Usd.Prim:
 
 
 def _add_together(
-    stage: Usd.Stage, scope: Sdf.Path, instances: Sequence[Instance], store: Store, settings: UsdSettings
+    stage: Usd.Stage,
+    scope: Sdf.Path,
+    instances: Sequence[Instance],
+    store: Store,
+    settings: UsdSettings,
+    solids: Solids | None,
 ) -> dict[int, Sdf.Path]:
     """Add instances through a stage of their own; return their paths. The cost of each edit grows with the size of its
     stage.
     """
     part = Usd.Stage.CreateInMemory()
     UsdGeom.Xform.Define(part, scope)
-    paths = {instance.id: _add(part, scope, instance, store, settings) for instance in instances}
+    paths = {instance.id: _add(part, scope, instance, store, settings, solids) for instance in instances}
     with Sdf.ChangeBlock():
         _take_over(part.GetRootLayer(), stage.GetRootLayer(), Sdf.Path("/World"))
     return paths
@@ -201,12 +208,19 @@ def _take_over(part: Sdf.Layer, layer: Sdf.Layer, path: Sdf.Path) -> None:
             Sdf.CopySpec(part, spec.path, layer, spec.path)
 
 
-def _add(stage: Usd.Stage, scope: Sdf.Path, instance: Instance, store: Store, settings: UsdSettings) -> Sdf.Path:
+def _add(
+    stage: Usd.Stage,
+    scope: Sdf.Path,
+    instance: Instance,
+    store: Store,
+    settings: UsdSettings,
+    solids: Solids | None,
+) -> Sdf.Path:
     """Add an instance with its points or mesh, and its motion; return its path."""
     limit = settings.points_per_structure if instance.structure else settings.points_per_instance
     path = _add_instance(stage, scope, instance, thinned_support(store, instance, limit))
     if settings.mesh or settings.colliders:
-        _add_surface(stage, path, instance, store, settings)
+        _add_surface(stage, path, instance, store, solids)
     if instance.dynamic and has_box(instance):
         _animate(stage.GetPrimAtPath(path), instance, store)
     return path
@@ -242,23 +256,27 @@ def _group(stage: Usd.Stage, path: Sdf.Path) -> Sdf.Path:
     return path
 
 
-def _add_surface(stage: Usd.Stage, path: Sdf.Path, instance: Instance, store: Store, settings: UsdSettings) -> None:
-    """Add the mesh of an instance in place of its points, where its support allows one."""
-    seen = None if settings.colliders else instance_surface(store, instance.id)
-    mesh = instance_mesh(store, instance) if seen is None else InstanceMesh.seen(seen)
-    if mesh is None:
-        return
+def _add_surface(stage: Usd.Stage, path: Sdf.Path, instance: Instance, store: Store, solids: Solids | None) -> None:
+    """Add the mesh of an instance in place of its points, where its support allows one; with `solids` it collides."""
     box = instance.box
     T_world_object = Sim3(np.ones(()), box.rotation, box.center) if has_box(instance) else Sim3.identity()
-    prim = add_mesh(stage, path.AppendChild("mesh"), mesh, T_world_object)
+    if solids is not None and instance.structure is None:
+        solid = solids.of(instance)
+        prim = None if solid is None else add_solid(stage, path, solid, T_world_object)
+    else:
+        seen = instance_surface(store, instance.id) if solids is None else None
+        mesh = instance_mesh(store, instance) if seen is None else InstanceMesh.seen(seen)
+        prim = None if mesh is None else add_mesh(stage, path.AppendChild("mesh"), mesh, T_world_object)
+        if prim is not None and solids is not None:
+            add_collider(prim, fixed=True)
+    if prim is None:
+        return
     looks = UsdGeom.Scope.Define(stage, "/World/Looks").GetPath().AppendChild("seen")
     material = UsdShade.Material.Get(stage, looks) or add_vertex_material(stage, looks)
     bind(prim.GetPrim(), material)
     points = stage.GetPrimAtPath(path.AppendChild("points"))
     if points:
         UsdGeom.Imageable(points).MakeInvisible()
-    if settings.colliders:
-        add_collider(prim, fixed=instance.structure is not None)
 
 
 def _animate(prim: Usd.Prim, instance: Instance, store: Store) -> None:

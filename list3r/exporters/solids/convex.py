@@ -1,0 +1,169 @@
+"""Convex parts of voxels: cut where that leaves least that is hull alone, along the axes of an instance.
+
+CoACD (Wei et al., SIGGRAPH 2022) looks for such cuts in a triangle mesh, by a tree search. Voxels know their volume and
+their axes are those of boards and legs, so that a few cuts need to be tried.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+from list3r.exporters.meshes.closed import ClosedSurface, hull
+from list3r.memory.core.geometry import Array
+
+Cells = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ConvexSettings:
+    """How far voxels are cut."""
+
+    parts: int = 32
+    """At most."""
+    unfilled: float = 0.75
+    """Voxels: how deep a hull is unfilled, as a mean over its surface, from which it is cut."""
+    cuts: int = 8
+    """Along each axis at once, at most,"""
+    step: float = 0.25
+    """where the area changes by so much of the most that it does."""
+    corners: int = 64
+    """Of a part at most: what simulators take (PhysX)."""
+
+
+def convex_parts(
+    solid: NDArray[np.bool_], place: Callable[[Cells], Array], settings: ConvexSettings | None = None
+) -> tuple[ClosedSurface, ...]:
+    """Return convex parts that together are about the solid.
+
+    `place` returns where corners of voxels lie, given the indices of the voxels above them, (N, 3) each.
+    """
+    s = settings or ConvexSettings()
+    queue = [_Piece.of(cells) for cells in _connected(np.argwhere(solid))]
+    heapq.heapify(queue)
+    done = []
+    while queue:
+        piece = heapq.heappop(queue)
+        pieces = _cut(piece, s.parts - len(queue) - len(done), s) if piece.unfilled > s.unfilled else [piece]
+        if len(pieces) == 1:
+            done += pieces
+        for one in pieces[len(pieces) == 1 :]:
+            heapq.heappush(queue, one)
+    done = sorted(done, key=lambda p: -len(p.cells))[: s.parts]
+    return tuple(_hull(place(piece.corners), s.corners) for piece in done)
+
+
+@dataclass(frozen=True, order=True)
+class _Piece:
+    order: float
+    excess: float = field(compare=False)
+    """Volume of the hull that is empty, voxels."""
+    unfilled: float = field(compare=False)
+    cells: Cells = field(compare=False)
+    corners: Cells = field(compare=False)
+    """Of the outer voxels of each column. Shape (N, 3)."""
+
+    @staticmethod
+    def of(cells: Cells) -> _Piece:
+        """Return a piece of voxels, (N, 3)."""
+        corners = _outer_corners(cells)
+        found = ConvexHull(corners)
+        excess = float(found.volume) - len(cells)
+        return _Piece(-excess, excess, 2 * excess / float(found.area), cells, corners)
+
+
+def _outer_corners(cells: Cells) -> Cells:
+    """Return the first and last corner of voxels along their shortest axis, all that their hull needs. (M, 3)."""
+    low = cells.min(axis=0)
+    count = cells.max(axis=0) - low + 1
+    rest = np.sort(np.argsort(count, kind="stable")[1:])
+    axis = 3 - int(rest.sum())
+    first = np.full(tuple(count[rest] + 1), count[axis] + 1)
+    last = np.full(first.shape, -1)
+    x, y = (cells[:, rest] - low[rest]).T
+    z = cells[:, axis] - low[axis]
+    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        np.minimum.at(first, (x + dx, y + dy), z)
+        np.maximum.at(last, (x + dx, y + dy), z + 1)
+    at = np.argwhere(last > 0)
+    ends = [np.insert(at, axis, heights[tuple(at.T)], axis=1) for heights in (first, last)]
+    return np.asarray(np.concatenate(ends) + low)
+
+
+def _connected(cells: Cells) -> list[Cells]:
+    """Return the connected parts of voxels; specks of fewer than eight go."""
+    if not len(cells):
+        return []
+    low = cells.min(axis=0)
+    mask = np.zeros(tuple(cells.max(axis=0) - low + 1), bool)
+    at = tuple((cells - low).T)
+    mask[at] = True
+    parts, count = ndimage.label(mask)
+    if count == 1:
+        return [cells]
+    which = parts[at]
+    return [cells[which == n] for n in np.flatnonzero(np.bincount(which) >= 8)] or [cells]
+
+
+def _cut(piece: _Piece, room: int, s: ConvexSettings) -> list[_Piece]:
+    """Return the pieces of the cut that saves most excess for each further piece, at most `room`; itself where none
+    saves any.
+    """
+    steps = [_steps(piece.cells, axis, s) for axis in range(3)]
+    middles = [_middle(piece.cells[:, axis]) for axis in range(3)]
+    tried = [_cut_at([piece], axis, (at,)) for axis in range(3) for at in {*steps[axis], middles[axis]}]
+    for one, two in itertools.permutations(range(3), 2):
+        if one < two:
+            tried.append(_cut_at(_cut_at([piece], one, (middles[one],)), two, (middles[two],)))  # a ring
+        slices = _cut_at([piece], one, steps[one])
+        finer = [p for c in slices for p in ([c] if c.unfilled <= s.unfilled else _sliced(c, two, s))]
+        tried += [slices, finer]  # an open box: its boards, then its sides
+    useful = [t for t in tried if 1 < len(t) <= room]
+    return max(useful, key=lambda t: (piece.excess - sum(p.excess for p in t)) / (len(t) - 1), default=[piece])
+
+
+def _sliced(piece: _Piece, axis: int, s: ConvexSettings) -> list[_Piece]:
+    return _cut_at([piece], axis, _steps(piece.cells, axis, s))
+
+
+def _cut_at(pieces: Sequence[_Piece], axis: int, places: Sequence[int]) -> list[_Piece]:
+    """Return what cuts above some layers of an axis leave of pieces."""
+    out = []
+    for piece in pieces:
+        layer = np.searchsorted(np.sort(places), piece.cells[:, axis])
+        out += [_Piece.of(c) for n in np.unique(layer) for c in _connected(piece.cells[layer == n])]
+    return out
+
+
+def _steps(cells: Cells, axis: int, s: ConvexSettings) -> tuple[int, ...]:
+    """Return the layers above which the area changes most, as where a board begins."""
+    at = cells[:, axis]
+    change = np.abs(np.diff(np.bincount(at - at.min())))
+    if not len(change):
+        return ()
+    most = np.argsort(-change, kind="stable")[: s.cuts]
+    return tuple((at.min() + most[change[most] >= s.step * change.max()]).tolist())
+
+
+def _middle(at: Cells) -> int:
+    return int((at.min() + at.max() - 1) // 2)
+
+
+_DIRECTIONS = np.random.default_rng(0).normal(size=(400, 3))
+
+
+def _hull(points: Array, most: int) -> ClosedSurface:
+    """Return the hull of points with at most so many corners: those farthest along directions all around."""
+    whole = hull(points)
+    if len(whole.vertices) <= most:
+        return whole
+    far = (whole.vertices @ _DIRECTIONS.T).argmax(axis=0)
+    kept, first = np.unique(far, return_index=True)
+    return hull(whole.vertices[kept[np.argsort(first)][:most]])
