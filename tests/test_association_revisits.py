@@ -107,7 +107,7 @@ def test_a_network_is_asked_a_bounded_number_of_times_where_features_fail(here: 
 
 def test_a_network_is_not_asked_where_features_tell(here: Keyframe, again: Keyframe) -> None:
     asked: list[Sequence[int]] = []
-    far = replace(here, frame_index=100, descriptor=-here.descriptor)
+    far = replace(here, frame_index=150, keypoint_descriptors=here.keypoint_descriptors[:0])
     store = Chunks([(here,), (far,), (again,)], scale_kind="relative")
     edges = find_loops(store, 2, lambda *ends: asked.append(ends), RevisitSettings(second_opinions=3))  # type: ignore[arg-type,func-returns-value]
     assert not asked and [e.accepted for e in edges] == [True]
@@ -252,7 +252,7 @@ def test_triples_give_the_similarities_that_each_gives_by_itself() -> None:
 
 
 def test_loops_are_found_among_stored_chunks(here: Keyframe, again: Keyframe) -> None:
-    store = Chunks([(here,), keyframes_at(3.0, first=100), (again,)])
+    store = Chunks([(here,), keyframes_at(3.0, first=150), (again,)])
     edges = find_loops(store, 2)
     assert [(e.u, e.v) for e in edges if e.accepted] == [(0, 2)]
     assert all(e.u != 1 for e in edges)
@@ -261,7 +261,7 @@ def test_loops_are_found_among_stored_chunks(here: Keyframe, again: Keyframe) ->
 
 
 def test_loops_of_chunks_without_scale(here: Keyframe, again: Keyframe) -> None:
-    store = Chunks([(rescaled(here, 2.0),), keyframes_at(3.0, first=100), (again,)], "relative")
+    store = Chunks([(rescaled(here, 2.0),), keyframes_at(3.0, first=150), (again,)], "relative")
     edges = [e for e in find_loops(store, 2) if e.accepted]
     assert [(e.u, e.v) for e in edges] == [(0, 2)]
     assert float(edges[0].S_v_u.scale) == pytest.approx(0.5, rel=0.02)
@@ -296,9 +296,7 @@ def test_things_tell_which_of_two_places_that_frames_say_is_right(here: Keyframe
 
 
 def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyframe, again: Keyframe) -> None:
-    noise = np.random.default_rng(0).normal(0, 1, len(again.descriptor))
-    mixed = again.descriptor + 3 * noise / np.linalg.norm(noise)
-    less = replace(again, descriptor=mixed / np.linalg.norm(mixed), keypoints_xy=again.keypoints_xy[:0])
+    less = replace(again, keypoint_descriptors=again.keypoint_descriptors[::60], keypoints_xy=again.keypoints_xy[:0])
     memory = Chunks([(here,), (), (less,)])
     for edges, refused in (
         (find_loops(memory, 2), False),
@@ -309,7 +307,8 @@ def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyf
 
 
 def test_chunks_without_keyframes_or_with_broken_descriptors(here: Keyframe, again: Keyframe) -> None:
-    broken = replace(here, descriptor=np.full_like(here.descriptor, np.nan))
+    nothing = here.keypoint_descriptors[:0]
+    broken = replace(here, descriptor=np.full_like(here.descriptor, np.nan), keypoint_descriptors=nothing)
     assert find_loops(Chunks([(), (), ()]), 2) == []
     assert find_loops(Chunks([(here,), (), ()]), 2) == []
     assert find_loops(Chunks([(broken,), (), (again,)]), 2) == []
@@ -328,7 +327,7 @@ def test_descriptors_that_are_all_equal_stay_within_the_quota(here: Keyframe) ->
     edges = find_loops(Chunks([chunk(200 * k) for k in range(8)]), 7)
     settings = SearchSettings()
     assert 0 < len(edges) <= settings.per_chunk
-    assert max(sum(e.u == k for e in edges) for k in range(8)) <= settings.per_pair
+    assert max(sum(e.u == k for e in edges) for k in range(8)) <= settings.per_pair_of_sessions
 
 
 def test_appending_chunks_gives_the_same_candidates_as_reading_all_at_once(here: Keyframe, again: Keyframe) -> None:
