@@ -298,12 +298,16 @@ def _described(store: Store, chunk_id: int) -> _Described:
     if descriptors.shape[1] in CLASSICAL:
         features = [store.keyframes.get(chunk_id, int(frame)).keypoint_descriptors for frame in keys[:, 1]]
         if all(f.shape[1] == SIFT_WIDTH for f in features) and sum(map(len, features)):
-            reduced = [_unit(Vocabulary.built_in().reduced(root_sift(f))) for f in features]
-            return _Described(
-                keys, [np.pad(x, ((0, 0), (0, -x.shape[1] % 8))) for x in reduced], 0
-            )  # FAISS takes eight
+            return _Described(keys, sift_rows(features), 0)
     sound = np.where(np.isfinite(descriptors).all(axis=1, keepdims=True), descriptors, np.float32(0))
     return _Described(keys, _unit(np.asarray(sound, np.float32)), sound.shape[1])
+
+
+def sift_rows(features: Sequence[NDArray[np.uint8]]) -> list[Floats]:
+    """Return the SIFT descriptors (N, 128) of each frame as unit vectors (N, d) for `FeatureIndex`, d of whole words of
+    eight."""
+    reduced = [_unit(Vocabulary.built_in().reduced(root_sift(f))) for f in features]
+    return [np.pad(x, ((0, 0), (0, -x.shape[1] % 8))) for x in reduced]
 
 
 def _unit(vectors: Floats) -> Floats:
