@@ -43,7 +43,7 @@ from list3r.simulation.rendering.render import Renderer
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-APART, NEAR_M, NEAR_DEG, MANY = 80, 1.5, 45.0, 2000
+APART, NEAR_M, NEAR_DEG, MANY, CHUNK = 80, 1.5, 45.0, 2000, 32
 EVERY = {"walk": 3, "source": 8, "simulated": 12}
 """Of every so many frames one is taken; simulated ones have 30 a second."""
 
@@ -167,7 +167,8 @@ def measure(r: Recording, learned: dict[str, Aggregation], aliked: Path | None) 
             add(name, counts, 1000 * MANY * (time.process_time() - started) / max(1, np.tril(apart).sum()))
     index, queries = FeatureIndex(), sift_rows(sift)
     keys = np.stack([np.zeros_like(r.number), r.number], axis=1)
-    index.add(keys, queries)
+    for first in range(0, len(keys), CHUNK):
+        index.add(keys[first : first + CHUNK], queries[first : first + CHUNK])
     found_rows, found_votes = index.search(queries, apart, len(keys))
     votes = np.zeros(apart.shape)
     np.put_along_axis(votes, found_rows, found_votes, axis=1)

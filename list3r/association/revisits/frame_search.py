@@ -48,7 +48,7 @@ _VOTERS = 400
 """as many as a keyframe has: few features that agree tell little."""
 _KEYFRAMES = 2000
 """Beyond this many, only the strongest features of a frame vote, so that a search takes no longer."""
-_CELLS, _ROWS, _PROBES, _NEIGHBOURS = 1024, 12, 4, 10
+_CELLS, _ROWS, _PROBES, _NEIGHBOURS = 1024, 12, 4, 8
 """Most inverted lists; least features of the first chunk for each; lists that are searched for a feature; stored
 features that it votes for."""
 _OTHER = np.float32(0.1)
