@@ -6,6 +6,7 @@ python benchmarks/vocabulary.py --out list3r/reconstruction/features/vocabulary.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 import faiss
@@ -40,16 +41,19 @@ def main() -> None:
 
 
 def descriptors(preset: str, seed: int, every: int) -> np.ndarray:
-    """SIFT descriptors of some pictures of a simulated video, with the noise of a camera."""
+    """SIFT descriptors of some pictures of a simulated video."""
+    blank = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    found = (detect(p, blank, CAMERA, FeatureSettings()) for p in noisy_pictures(preset, seed, every))
+    return np.concatenate([f.descriptors for f in found])
+
+
+def noisy_pictures(preset: str, seed: int, every: int) -> Iterator[np.ndarray]:
+    """Some pictures of a simulated video, with the noise of a camera."""
     shot = make_shot(preset, seed, movers=False)
     renderer, rng = Renderer(shot.building.world, CAMERA), np.random.default_rng(seed)
-    out = []
     for pose in shot.T_world_cam[::every]:
         color = renderer.render(pose).color
-        noisy = np.clip(color + rng.normal(0, 3, color.shape), 0, 255).astype(np.uint8)
-        blank = np.zeros(noisy.shape[:2], np.float32)
-        out.append(detect(noisy, blank, CAMERA, FeatureSettings()).descriptors)
-    return np.concatenate(out)
+        yield np.clip(color + rng.normal(0, 3, color.shape), 0, 255).astype(np.uint8)
 
 
 if __name__ == "__main__":

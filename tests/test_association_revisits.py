@@ -13,7 +13,8 @@ import pytest
 from scipy.stats import chi2
 
 from list3r.association.paper.loops import loops_by_score
-from list3r.association.revisits.frame_search import TRAINED, SearchSettings, choose
+from list3r.association.revisits.frame_search import TRAINED, FeatureIndex, SearchSettings, choose, find_candidates
+from list3r.association.revisits.instance_similarity import InstanceSimilarity
 from list3r.association.revisits.scaled_verification import _fit, _similarities, verify_scaled
 from list3r.association.revisits.search import RevisitSettings, find_loops
 from list3r.association.revisits.verification import VerificationSettings, verify
@@ -107,7 +108,7 @@ def test_a_network_is_asked_a_bounded_number_of_times_where_features_fail(here: 
 
 def test_a_network_is_not_asked_where_features_tell(here: Keyframe, again: Keyframe) -> None:
     asked: list[Sequence[int]] = []
-    far = replace(here, frame_index=100, descriptor=-here.descriptor)
+    far = replace(here, frame_index=150, keypoint_descriptors=here.keypoint_descriptors[:0])
     store = Chunks([(here,), (far,), (again,)], scale_kind="relative")
     edges = find_loops(store, 2, lambda *ends: asked.append(ends), RevisitSettings(second_opinions=3))  # type: ignore[arg-type,func-returns-value]
     assert not asked and [e.accepted for e in edges] == [True]
@@ -252,7 +253,7 @@ def test_triples_give_the_similarities_that_each_gives_by_itself() -> None:
 
 
 def test_loops_are_found_among_stored_chunks(here: Keyframe, again: Keyframe) -> None:
-    store = Chunks([(here,), keyframes_at(3.0, first=100), (again,)])
+    store = Chunks([(here,), keyframes_at(3.0, first=150), (again,)])
     edges = find_loops(store, 2)
     assert [(e.u, e.v) for e in edges if e.accepted] == [(0, 2)]
     assert all(e.u != 1 for e in edges)
@@ -261,7 +262,7 @@ def test_loops_are_found_among_stored_chunks(here: Keyframe, again: Keyframe) ->
 
 
 def test_loops_of_chunks_without_scale(here: Keyframe, again: Keyframe) -> None:
-    store = Chunks([(rescaled(here, 2.0),), keyframes_at(3.0, first=100), (again,)], "relative")
+    store = Chunks([(rescaled(here, 2.0),), keyframes_at(3.0, first=150), (again,)], "relative")
     edges = [e for e in find_loops(store, 2) if e.accepted]
     assert [(e.u, e.v) for e in edges] == [(0, 2)]
     assert float(edges[0].S_v_u.scale) == pytest.approx(0.5, rel=0.02)
@@ -296,9 +297,7 @@ def test_things_tell_which_of_two_places_that_frames_say_is_right(here: Keyframe
 
 
 def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyframe, again: Keyframe) -> None:
-    noise = np.random.default_rng(0).normal(0, 1, len(again.descriptor))
-    mixed = again.descriptor + 3 * noise / np.linalg.norm(noise)
-    less = replace(again, descriptor=mixed / np.linalg.norm(mixed), keypoints_xy=again.keypoints_xy[:0])
+    less = replace(again, keypoint_descriptors=again.keypoint_descriptors[::60], keypoints_xy=again.keypoints_xy[:0])
     memory = Chunks([(here,), (), (less,)])
     for edges, refused in (
         (find_loops(memory, 2), False),
@@ -309,7 +308,8 @@ def test_frames_less_alike_are_refused_only_where_nothing_is_verified(here: Keyf
 
 
 def test_chunks_without_keyframes_or_with_broken_descriptors(here: Keyframe, again: Keyframe) -> None:
-    broken = replace(here, descriptor=np.full_like(here.descriptor, np.nan))
+    nothing = here.keypoint_descriptors[:0]
+    broken = replace(here, descriptor=np.full_like(here.descriptor, np.nan), keypoint_descriptors=nothing)
     assert find_loops(Chunks([(), (), ()]), 2) == []
     assert find_loops(Chunks([(here,), (), ()]), 2) == []
     assert find_loops(Chunks([(broken,), (), (again,)]), 2) == []
@@ -328,7 +328,7 @@ def test_descriptors_that_are_all_equal_stay_within_the_quota(here: Keyframe) ->
     edges = find_loops(Chunks([chunk(200 * k) for k in range(8)]), 7)
     settings = SearchSettings()
     assert 0 < len(edges) <= settings.per_chunk
-    assert max(sum(e.u == k for e in edges) for k in range(8)) <= settings.per_pair
+    assert max(sum(e.u == k for e in edges) for k in range(8)) <= settings.per_pair_of_sessions
 
 
 def test_appending_chunks_gives_the_same_candidates_as_reading_all_at_once(here: Keyframe, again: Keyframe) -> None:
@@ -351,6 +351,66 @@ def test_candidates_keep_their_distance_and_their_quota() -> None:
     assert all(a.cosine >= b.cosine for a, b in itertools.pairwise(found))
     again = choose(new, stored, cosine, TRAINED, SearchSettings(), {1})
     assert sum(c.u == 1 for c in again) == SearchSettings().per_pair_of_sessions
+
+
+def test_features_vote_for_the_frame_that_shows_the_same_place() -> None:
+    rng = np.random.default_rng(0)
+    frames = [unit(rng.normal(size=(200, 32))) for _ in range(60)]
+    index = FeatureIndex()
+    for first in range(0, 60, 20):
+        keys = np.array([(first, k) for k in range(first, first + 20)])
+        index.add(keys, frames[first : first + 20])
+    asked = unit(rng.normal(size=(200, 32)))
+    asked[:30] = unit(frames[41][:30] + rng.normal(0, 0.04, (30, 32)))
+    allowed = np.ones((1, 60), bool)
+    rows, votes = index.search([asked], allowed, 5)
+    assert rows[0, 0] == 41 and votes[0, 0] > 3 * votes[0, 1]
+    allowed[0, 41] = False
+    rows, votes = index.search([asked], allowed, 60)
+    assert votes[rows == 41].max(initial=0.0) == 0.0
+
+
+def test_a_place_seen_from_many_keyframes_is_found_all_the_same() -> None:
+    rng = np.random.default_rng(0)
+    place = unit(rng.normal(size=(200, 32)))
+    frames = [place] * 15 + [unit(rng.normal(size=(200, 32))) for _ in range(30)]
+    index = FeatureIndex()
+    index.add(np.array([(0, k) for k in range(45)]), frames)
+    rows, votes = index.search([place], np.ones((1, 45), bool), 45)
+    of_place = votes[rows < 15]
+    assert of_place.sum() > 20 * votes[rows >= 15].sum() and of_place.max() > 0.03
+
+
+def unit(x: np.ndarray) -> np.ndarray:
+    return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True), np.float32)
+
+
+def test_frames_of_neighbouring_chunks_are_a_revisit_only_far_apart(here: Keyframe, again: Keyframe) -> None:
+    far, near = (find_candidates(Chunks([(here,), (replace(again, frame_index=n),)]), 1) for n in (90, 70))
+    assert [(c.frame_u, c.frame_v) for c in far] == [(0, 90)] and not near
+
+
+def test_two_chunks_are_joined_at_frames_apart(here: Keyframe, again: Keyframe) -> None:
+    then = replace(here, frame_index=40)
+    now = [replace(again, frame_index=n) for n in (200, 203, 240)]
+    between = [
+        Edge(k, k + 1, "adjacent", Sim3.identity(), 0.9, 0.9, 99, 0.0, True, "", {"spread": 3.0}) for k in (0, 1)
+    ]
+    between[1] = replace(between[1], S_v_u=Sim3.from_matrix(GAUGE))
+    edges = find_loops(Chunks([(here, then), (), tuple(now)], known=between), 2)
+    frames = [e.frames for e in edges if e.accepted]
+    assert len(frames) == 2
+    (a, b), (c, d) = sorted(frames)
+    assert {a, c} == {0, 40} and abs(b - d) >= 4
+
+
+def test_a_metric_relation_is_not_refused_by_the_layout_of_instances(here: Keyframe, again: Keyframe) -> None:
+    layout = InstanceSimilarity(0.9, 0.9, tuple((k, k) for k in range(6)), float(np.log(2.2)))
+    store = [(here,), keyframes_at(3.0, first=150), (again,)]
+    with patch("list3r.association.revisits.search.compare_instances", return_value=layout):
+        for kind, accepted in (("metric", True), ("relative", False)):
+            edges = find_loops(Chunks(store, kind), 2)
+            assert any(e.accepted for e in edges) is accepted
 
 
 def test_cosines_are_put_on_one_scale() -> None:

@@ -1,9 +1,14 @@
-"""Find similar frames: exact search over the descriptors of all keyframes (research/association 0047)."""
+"""Find similar frames among all keyframes.
+
+Frames with SIFT features are found by these: the nearest stored features of each one vote for their frames, the more
+the nearer they are against those that follow. Others are found by exact search over one descriptor of each frame
+(research/association 0047).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +16,8 @@ from numpy.typing import NDArray
 
 from list3r.memory.core.records import ChunkRow
 from list3r.memory.store.store import Store
+from list3r.reconstruction.features.local import SIFT_WIDTH
+from list3r.reconstruction.features.vlad import Vocabulary, root_sift
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -33,11 +40,19 @@ class DescriptorScale:
 
 TRAINED = DescriptorScale(0.5, 0.85)
 """Trained place recognition, and its simulation."""
-CLASSICAL: Mapping[int, DescriptorScale] = {
-    384: DescriptorScale(0.6, 0.75),
-    1984: DescriptorScale(0.08, 0.22),
-}
-"""The classical descriptors of `reconstruction.descriptor` and `reconstruction.vlad`, by their length."""
+CLASSICAL: Mapping[int, DescriptorScale] = {1984: DescriptorScale(0.08, 0.22)}
+"""The descriptors of `reconstruction.features.vlad`, by their length."""
+VOTES = DescriptorScale(0.0075, 0.03)
+"""Votes of local features, as a share of"""
+_VOTERS = 400
+"""as many as a keyframe has: few features that agree tell little."""
+_KEYFRAMES = 2000
+"""Beyond this many, only the strongest features of a frame vote, so that a search takes no longer."""
+_CELLS, _ROWS, _PROBES, _NEIGHBOURS = 1024, 12, 4, 8
+"""Most inverted lists; least features of the first chunk for each; lists that are searched for a feature; stored
+features that it votes for."""
+_OTHER = np.float32(0.1)
+"""Least squared distance of a feature of something else, where all that are found are of one place."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +63,17 @@ class SearchSettings:
     """Chunks just before in the same video that are neighbours, not revisits."""
     exclude_frames: int = 30
     """Frames of one video this close are no revisit either."""
+    neighbour_frames: int = 80
+    """Frames of neighbouring chunks this far apart may be a revisit all the same, by their features."""
     nearest: int = 256
     """Stored frames compared with each new one."""
+    mutual: bool = True
+    """Only mutual nearest neighbours are candidates."""
     suppress_frames: int = 20
     """A pair within this many frames of a better one, on both sides, is the same revisit."""
+    features_apart: int = 6
+    """The same of candidates by features, which need not be mutual nor the best to be verified: the most votes often
+    go to a frame that few others confirm."""
     per_chunk: int = 24
     """Most candidates of a new chunk."""
     per_pair: int = 2
@@ -75,6 +97,55 @@ class Candidate:
     """The cosine on the scale of trained place recognition."""
 
 
+class FeatureIndex:
+    """SIFT features of the stored keyframes: inverted lists of cells round the first features."""
+
+    def __init__(self) -> None:
+        self.keys: Ints = np.zeros((0, 2), np.int64)
+        self._owner: Ints = np.zeros(0, np.int64)
+        self._index: Any = None
+
+    def add(self, keys: Ints, features: Sequence[Floats]) -> None:
+        """Append rows: (chunk id, Frame.index) of shape (K, 2) and unit vectors (N, d) of each keyframe."""
+        import faiss
+
+        rows = np.concatenate(features)
+        if self._index is None:
+            count = min(_CELLS, 1 + len(rows) // _ROWS)
+            cells = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+            quantizer = faiss.IndexFlatL2(rows.shape[1])
+            quantizer.add(cells)
+            kind = faiss.ScalarQuantizer.QT_fp16
+            self._index = faiss.IndexIVFScalarQuantizer(
+                quantizer, rows.shape[1], len(cells), kind, faiss.METRIC_L2, False
+            )
+            self._index.is_trained = True
+        self._index.add(rows)
+        owner = np.repeat(np.arange(len(keys)) + len(self.keys), [len(f) for f in features])
+        self._owner = np.concatenate([self._owner, owner])
+        self.keys = np.concatenate([self.keys, keys])
+
+    def search(self, frames: Sequence[Floats], allowed: NDArray[np.bool_], k: int) -> tuple[Ints, Floats]:
+        """Return rows and votes of the k keyframes, allowed ones (Q, K), with most votes of each frame's features
+        (N, d). (Q, k)."""
+        import faiss
+
+        votes = np.zeros(allowed.shape, np.float32)
+        voters = max(_VOTERS // 8, min(_VOTERS, _VOTERS * _KEYFRAMES // len(self.keys)))
+        for n, features in enumerate(frames):
+            bitmap = np.packbits(allowed[n, self._owner], bitorder="little")
+            selector = faiss.IDSelectorBitmap(len(self._owner), faiss.swig_ptr(bitmap))
+            parameters: Any = faiss.SearchParametersIVF(sel=selector, nprobe=_PROBES)
+            distance, row = self._index.search(features[:voters], _NEIGHBOURS + 1, params=parameters)
+            distance = np.where(row >= 0, distance, 0.0)
+            beyond = np.maximum(distance.max(axis=1, keepdims=True), _OTHER)
+            vote = np.where(row >= 0, (1.0 - distance / beyond) ** 2, 0.0)
+            owner = self._owner[row].ravel()
+            votes[n] = np.bincount(owner, vote.ravel(), len(self.keys)) / voters
+        rows = np.argsort(-votes, axis=1, kind="stable")[:, :k]
+        return rows, np.take_along_axis(votes, rows, axis=1)
+
+
 class FrameIndex:
     """Descriptors of the stored keyframes of one length."""
 
@@ -91,11 +162,13 @@ class FrameIndex:
         self.index.add(np.ascontiguousarray(descriptors))
 
     def search(self, descriptors: Floats, allowed: NDArray[np.bool_], k: int) -> tuple[Ints, Floats]:
-        """Return rows and cosines of k nearest allowed ones of each descriptor, -1 where there are fewer. (Q, k)."""
-        bitmap = np.packbits(allowed, bitorder="little")
-        selector = self._faiss.IDSelectorBitmap(len(allowed), self._faiss.swig_ptr(bitmap))
-        parameters: Any = self._faiss.SearchParameters(sel=selector)  # type: ignore[call-arg]
-        cosines, rows = self.index.search(np.ascontiguousarray(descriptors), k, params=parameters)
+        """Return rows and cosines of the k nearest of each descriptor, allowed ones (Q, K); -1 where there are fewer.
+        (Q, k)."""
+        rows, cosines = np.empty((len(descriptors), k), np.int64), np.empty((len(descriptors), k), np.float32)
+        for n, bitmap in enumerate(np.packbits(allowed, axis=1, bitorder="little")):
+            selector = self._faiss.IDSelectorBitmap(allowed.shape[1], self._faiss.swig_ptr(bitmap))
+            parameters: Any = self._faiss.SearchParameters(sel=selector)  # type: ignore[call-arg]
+            cosines[n], rows[n] = self.index.search(descriptors[n : n + 1], k, params=parameters)
         return rows, cosines
 
 
@@ -105,37 +178,54 @@ class FrameIndices:
 
     checksums: dict[int, int] = field(default_factory=dict)
     """Of the chunks that were read, by chunk id."""
-    by_length: dict[int, FrameIndex] = field(default_factory=dict)
+    by_kind: dict[int, FrameIndex | FeatureIndex] = field(default_factory=dict)
+    """By the length of descriptors; 0: of features."""
 
     def clear(self) -> None:
         """Forget the descriptors that were read."""
         self.checksums.clear()
-        self.by_length.clear()
+        self.by_kind.clear()
+
+
+@dataclass(frozen=True)
+class _Described:
+    """The keyframes of a chunk."""
+
+    keys: Ints
+    """Chunk id and Frame.index. Shape (K, 2)."""
+    looks: Any
+    """Unit vectors: (K, D) of whole frames, or (N, d) of the features of each one."""
+    kind: int
+    """As in `FrameIndices.by_kind`."""
 
 
 def find_candidates(store: Store, chunk_id: int, settings: SearchSettings | None = None) -> list[Candidate]:
     """Find stored frames similar to frames of a chunk, best first; of chunks that came before it only."""
     chosen = settings or SearchSettings()
     rows = {c.chunk_id: c for c in store.chunks.all()}
-    own_keys, own = _descriptors(store, [chunk_id])
-    if not len(own_keys):
+    own = _described(store, chunk_id)
+    index = _index(store, [k for k in rows if k < chunk_id]).by_kind.get(own.kind)
+    if index is None or not len(own.keys):
         return []
-    index = _index(store, [k for k in rows if k < chunk_id]).by_length.get(own.shape[1])
-    if index is None:
-        return []
-    allowed_chunks = [k for k, row in rows.items() if is_revisit(rows[chunk_id], row, chosen)]
-    allowed = np.isin(index.keys[:, 0], allowed_chunks)
+    here, ids = rows[chunk_id], index.keys[:, 0]
+    revisit = np.isin(ids, [k for k, row in rows.items() if is_revisit(here, row, chosen)])
+    same_video = np.isin(ids, [k for k, row in rows.items() if row.session_id == here.session_id])
+    least = np.where(revisit, chosen.exclude_frames + 1, chosen.neighbour_frames)
+    off = np.abs(index.keys[None, :, 1] - own.keys[:, None, 1])
+    allowed = (revisit if own.kind else ids < chunk_id) & ~(same_video & (off < least))
     if not allowed.any():
         return []
-    found, cosines = index.search(own, allowed, min(chosen.nearest, int(allowed.sum())))
-    new = np.repeat(np.arange(len(own)), found.shape[1])
-    stored, cosine = found.ravel(), cosines.ravel()
-    same_video = np.array([rows[int(k)].session_id == rows[chunk_id].session_id for k in index.keys[stored, 0]], bool)
-    near = same_video & (np.abs(index.keys[stored, 1] - own_keys[new, 1]) <= chosen.exclude_frames)
-    scale = CLASSICAL.get(own.shape[1], TRAINED)
-    keep = (stored >= 0) & (cosine >= scale.relaxed) & ~near
-    later = {k for k in allowed_chunks if rows[k].session_id != rows[chunk_id].session_id}
-    return choose(own_keys[new[keep], 1], index.keys[stored[keep]], cosine[keep], scale, chosen, later)
+    found, likeness = index.search(own.looks, allowed, min(chosen.nearest, int(allowed.any(axis=0).sum())))
+    new = np.repeat(np.arange(len(own.keys)), found.shape[1])
+    stored, likeness = found.ravel(), likeness.ravel()
+    scale = CLASSICAL.get(own.kind, TRAINED) if own.kind else VOTES
+    keep = (stored >= 0) & (likeness >= scale.relaxed)
+    if not own.kind:
+        chosen = replace(
+            chosen, suppress_frames=chosen.features_apart, per_pair=chosen.per_pair_of_sessions, mutual=False
+        )
+    later = {k for k, row in rows.items() if row.session_id != here.session_id}
+    return choose(own.keys[new[keep], 1], index.keys[stored[keep]], likeness[keep], scale, chosen, later)
 
 
 def choose(
@@ -146,7 +236,7 @@ def choose(
     settings: SearchSettings,
     other_sessions: Collection[int] = (),
 ) -> list[Candidate]:
-    """Return the mutual nearest neighbours between pairs of chunks, thinned out in time, with a quota for each pair of
+    """Return the similar frames of pairs of chunks, thinned out in time, with a quota for each pair of
     chunks.
 
     `frame_v` (P,) is Frame.index in the new chunk, `stored` (P, 2) chunk id and Frame.index, `cosine` (P,).
@@ -160,7 +250,7 @@ def choose(
     out: list[Candidate] = []
     for n in np.lexsort((frame_v, stored[:, 1], stored[:, 0], -cosine)):
         f, chunk, frame, c = int(frame_v[n]), int(stored[n, 0]), int(stored[n, 1]), float(cosine[n])
-        if c < best_new[f, chunk] or c < best_old[chunk, frame]:
+        if settings.mutual and (c < best_new[f, chunk] or c < best_old[chunk, frame]):
             continue
         same = [k for k in out if k.u == chunk]
         near = settings.suppress_frames
@@ -191,18 +281,34 @@ def _index(store: Store, chunk_ids: Sequence[int]) -> FrameIndices:
         known.clear()
     missing = [k for k in sorted(checksums) if k not in known.checksums]
     for chunk_id in missing:
-        keys, descriptors = _descriptors(store, [chunk_id])
-        if len(keys):
-            known.by_length.setdefault(descriptors.shape[1], FrameIndex(descriptors.shape[1])).add(keys, descriptors)
+        chunk = _described(store, chunk_id)
+        if len(chunk.keys):
+            if (index := known.by_kind.get(chunk.kind)) is None:
+                index = known.by_kind[chunk.kind] = FrameIndex(chunk.kind) if chunk.kind else FeatureIndex()
+            index.add(chunk.keys, chunk.looks)
         known.checksums[chunk_id] = checksums[chunk_id]
     return known
 
 
-def _descriptors(store: Store, chunk_ids: Sequence[int]) -> tuple[Ints, Floats]:
-    """Return keys and unit descriptors of some chunks; one that is not finite becomes zero, similar to nothing."""
-    keys, descriptors = store.keyframes.descriptors(chunk_ids)
+def _described(store: Store, chunk_id: int) -> _Described:
+    """Return what the keyframes of a chunk look like; a descriptor that is not finite is similar to nothing."""
+    keys, descriptors = store.keyframes.descriptors([chunk_id])
     if not len(keys):
-        return keys, np.zeros((0, 0), np.float32)
-    descriptors = np.asarray(descriptors, np.float32)
+        return _Described(keys, (), 0)
+    if descriptors.shape[1] in CLASSICAL:
+        features = [store.keyframes.get(chunk_id, int(frame)).keypoint_descriptors for frame in keys[:, 1]]
+        if all(f.shape[1] == SIFT_WIDTH for f in features) and sum(map(len, features)):
+            return _Described(keys, sift_rows(features), 0)
     sound = np.where(np.isfinite(descriptors).all(axis=1, keepdims=True), descriptors, np.float32(0))
-    return keys, np.asarray(sound / np.maximum(np.linalg.norm(sound, axis=1, keepdims=True), np.float32(1e-12)))
+    return _Described(keys, _unit(np.asarray(sound, np.float32)), sound.shape[1])
+
+
+def sift_rows(features: Sequence[NDArray[np.uint8]]) -> list[Floats]:
+    """Return the SIFT descriptors (N, 128) of each frame as unit vectors (N, d) for `FeatureIndex`, d of whole words of
+    eight."""
+    reduced = [_unit(Vocabulary.built_in().reduced(root_sift(f))) for f in features]
+    return [np.pad(x, ((0, 0), (0, -x.shape[1] % 8))) for x in reduced]
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.float32(1e-12)))

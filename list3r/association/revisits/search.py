@@ -72,7 +72,7 @@ class RevisitSettings:
     least_score: float = 1.3
     """Of the rule score: least s_loop. The paper gives none; of 0.9 to 1.3 this one has the least error on the seeds
     1 to 3 of `benchmarks/association.py`, which no table holds."""
-    verify: int = 14
+    verify: int = 24
     """Most candidates of a chunk that are verified."""
     enough: int = 8
     """Accepted edges after which no further candidate of a chunk is verified."""
@@ -140,8 +140,7 @@ def _by_frames(
     tried = 0
     for scored in ranked(candidates, search, chosen.lambda_):
         accepted = [e for e in edges if e.accepted]
-        u = scored.candidate.u
-        if any(e.u == u for e in accepted) and not search.wants_another(u, accepted):
+        if not search.wants_another(scored.candidate, accepted):
             edge = search.refused(scored, "not tried: a better candidate joins the two chunks")
         elif tried >= chosen.verify or len(accepted) >= chosen.enough:
             edge = search.refused(scored, "not tried: enough better candidates of this chunk were tried")
@@ -251,8 +250,7 @@ class RevisitSearch:
         chain = None if self._apart(c.u) else self._chains.predict(c.u, self._id, found)
         metric = u.scale_kind == v.scale_kind == "metric"
         later = u.session_id != v.session_id
-        known = metric and later  # its scale, and objects may have been moved in between
-        objection = partial(self._objection, NO_SIMILARITY if known else scored.similarity, chain)
+        objection = partial(self._objection, NO_SIMILARITY if metric else scored.similarity, chain)
         edge = None
         keyframe_u, keyframe_v = self._keyframes(c)
         if _comparable(keyframe_u) and _comparable(keyframe_v):
@@ -268,9 +266,19 @@ class RevisitSearch:
         off = {"way": chain.deviations(edge.S_v_u)} if chain is not None and measured else {}
         return replace(edge, scores=edge.scores | off)
 
-    def wants_another(self, u: int, accepted: Sequence[Edge]) -> bool:
-        """Return whether only a single pair of frames joins a chunk to the new one so far."""
-        return self._apart(u) and len(accepted) == 1
+    def wants_another(self, c: Candidate, accepted: Sequence[Edge]) -> bool:
+        """Return whether a candidate would join two chunks at frames apart from those that join them so far.
+
+        Where a joint window has to tell, and between sessions, one relation of a pair of chunks is enough, but for a
+        single one of two components.
+        """
+        joined = [e for e in accepted if e.u == c.u]
+        if not joined or self._apart(c.u):
+            return not joined or len(accepted) == 1
+        apart = self._settings.further_pairs.apart
+        return all(map(_comparable, self._keyframes(c))) and all(
+            e.frames is not None and apart.of(e.frames, (c.frame_u, c.frame_v)) for e in joined
+        )
 
     def alone(self, edges: Sequence[Edge]) -> Edge | None:
         """Return the accepted edge that joins the new chunk to another session, if no other edge supports it."""

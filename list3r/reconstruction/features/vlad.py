@@ -36,6 +36,10 @@ class Vocabulary:
         with np.load(Path(__file__).with_name("vocabulary.npz"), allow_pickle=False) as data:
             return Vocabulary(*(data[name].astype(np.float32) for name in ("mean", "axes", "words")))
 
+    def reduced(self, rooted: Floats) -> Floats:
+        """Return RootSIFT descriptors (N, 128) along the principal directions (N, d)."""
+        return np.asarray((rooted - self.mean) @ self.axes)
+
 
 def describe_frame(local_descriptors: NDArray[np.uint8]) -> Floats:
     """Return the unit descriptor of a frame's SIFT descriptors (N, 128), zeros without any: residuals to their words.
@@ -50,7 +54,7 @@ def describe_rooted(rooted: Floats) -> Floats:
     v = Vocabulary.built_in()
     if not len(rooted):
         return np.zeros(v.words.size, np.float32)
-    x = (rooted - v.mean) @ v.axes
+    x = v.reduced(rooted)
     word = np.argmin((v.words**2).sum(axis=1) - 2.0 * x @ v.words.T, axis=1)
     sums = np.zeros(v.words.shape, np.float64)
     np.add.at(sums, word, x - v.words[word])
