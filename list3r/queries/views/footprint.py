@@ -50,7 +50,7 @@ def footprint(surface: InstanceSurface) -> Array:
     if surface.support is None or len(shadow) < 9 or longest <= 0.0:
         x, y = (box.rotation[:2, k] * box.size[k] / 2 for k in range(2))
         corners = box.center[:2] + np.array([-x - y, x - y, x + y, -x + y])
-        return corners if area_of(corners) >= 0 else corners[::-1]
+        return np.asarray(corners if area_of(corners) >= 0 else corners[::-1])
     radius = max(_CLOSED_SPACINGS * surface.spacing, _CLOSED_SHARE * longest)
     while True:
         ring = _closed(shadow, radius)
