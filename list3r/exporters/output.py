@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from list3r.memory.core.errors import ExportError, OptionError
-from list3r.memory.library.world.scale import lengths_of
 
 if TYPE_CHECKING:
     from list3r.memory.store.store import Store
@@ -156,6 +155,8 @@ def units(store: Store) -> str:
 
 def check_metre(store: Store, *, guessed: bool) -> None:
     """Raise `OptionError` for a memory without metric scale; where the metre is guessed, unless that is taken."""
+    from list3r.memory.library.world.scale import lengths_of  # numpy, which help does not need
+
     known = lengths_of(store).metric == "guessed"
     if units(store) != "m" and not (known and guessed):
         raise OptionError(

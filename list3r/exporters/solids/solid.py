@@ -18,8 +18,8 @@ from list3r.exporters.solids.convex import convex_parts
 from list3r.exporters.solids.evidence import Evidence, Mask, gather
 from list3r.memory.core.geometry import Array
 from list3r.memory.core.records import Instance, Support
-from list3r.memory.library.overlap.visibility import DepthView, views_of
-from list3r.memory.library.rules import WORLD
+from list3r.memory.library.overlap.visibility import DepthView, chunk_views
+from list3r.memory.library.world.world import WORLD
 from list3r.memory.store.store import Store
 
 _SEEN_CELLS = 1.5
@@ -102,7 +102,7 @@ class Solids:
 
     def _read_views(self, chunk_id: int) -> list[DepthView]:
         keyframes = self._store.keyframes.of(chunk_id)
-        return views_of([self._store.chunks.get(chunk_id)], {chunk_id: keyframes}, self._metre)
+        return chunk_views(self._store.chunks.get(chunk_id), keyframes, self._metre)
 
     def _stands(self, instance: Instance) -> float:
         """Return the height of what an instance stands on, where that is near its lowest points, else theirs."""
