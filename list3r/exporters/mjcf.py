@@ -145,7 +145,8 @@ def _boxes(instance: Instance, points: Array) -> list[tuple[Array, Array, Array]
 
 def _rectangles(cells: NDArray[np.bool_], most: int = 24, least: float = 0.01) -> list[tuple[int, int, int, int]]:
     """Return rectangles x0, y0, x1, y1 that cover cells, the largest first; small rests are left out."""
-    left, out, whole = cells.copy(), [], int(cells.sum())
+    left, whole = cells.copy(), int(cells.sum())
+    out: list[tuple[int, int, int, int]] = []
     while len(out) < most and left.any():
         best = (0, 0, 0, 0, 0)
         tall = np.zeros(left.shape[1], int)

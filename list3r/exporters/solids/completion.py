@@ -84,11 +84,10 @@ def _feet(shell: Mask, may: Mask, e: Evidence, s: CompletionSettings) -> Mask:
     """Return what is between the lowest of a shell and what the instance stands on, where that is near and unseen."""
     height = int(np.flatnonzero(shell.any(axis=(0, 1))).max(initial=e.rim)) - e.rim
     lowest = np.where(shell.any(axis=2), shell.argmax(axis=2), 0)
-    near = (lowest > e.rim) & (lowest - e.rim <= s.feet_share * height)
+    near = np.asarray((lowest > e.rim) & (lowest - e.rim <= s.feet_share * height))
     layer = np.arange(shell.shape[2])
     below = (layer >= e.rim) & (layer < lowest[:, :, None]) & near[:, :, None]
-    open_columns = (below & ~may).any(axis=2)
-    return np.asarray(below & ~open_columns[:, :, None])
+    return np.asarray(below & ~(below & ~may).any(axis=2, keepdims=True))
 
 
 def _behind(shell: Mask, may: Mask, free: Mask, solid: Mask, *, e: Evidence, s: CompletionSettings, down: bool) -> None:

@@ -48,7 +48,7 @@ def convex_parts(
     s = settings or ConvexSettings()
     queue = [_Piece.of(cells) for cells in _connected(np.argwhere(solid))]
     heapq.heapify(queue)
-    done = []
+    done: list[_Piece] = []
     while queue:
         piece = heapq.heappop(queue)
         pieces = _cut(piece, s.parts - len(queue) - len(done), s) if piece.unfilled > s.unfilled else [piece]

@@ -93,8 +93,8 @@ class Solids:
         low, high = instance.aabb + np.array([[-_AROUND_M], [_AROUND_M]]) * self._metre
         near = [self._all[n] for n in self._store.instances.ids_in_box(low, high) if n in self._all]
         beside = [i for i in near if i.component == instance.component and i.id != instance.id]
-        clouds = [np.zeros((0, 3)), *(thinned_support(self._store, i, _OTHERS).points for i in beside)]
-        others = np.concatenate(clouds)
+        clouds = [thinned_support(self._store, i, _OTHERS).points.astype(np.float64) for i in beside]
+        others = np.concatenate([np.zeros((0, 3)), *clouds])
         others = others[((others > low) & (others < high)).all(axis=1)]
         chunks = sorted({o.chunk_id for o in self._store.observations.of(instance.id)})
         views = [view for k in chunks for view in self._views(k)]
@@ -128,8 +128,9 @@ def solid_of(instance: Instance, around: Surroundings) -> Solid | None:
     points = around.support.points.astype(np.float64)
     points = points[dense(points)]
     if not around.views:
-        seen = cKDTree(points).query(mesh.surface.vertices)[0] < 2 * point_spacing(points.astype(np.float32))
-        return Solid(mesh, seen[mesh.surface.faces].all(axis=1), (hull(mesh.surface.vertices),))
+        away = np.asarray(cKDTree(points).query(mesh.surface.vertices)[0])
+        seen: NDArray[np.bool_] = away < 2 * point_spacing(points.astype(np.float32))
+        return Solid(mesh, np.asarray(seen[mesh.surface.faces].all(axis=1)), (hull(mesh.surface.vertices),))
     axes = upright_axes(instance.box.rotation)
     evidence = gather(points, around.others, around.views, axes, around.stands, around.metre)
     solid = completed(evidence)
@@ -157,25 +158,25 @@ def _surface(
     vertices = surface.vertices
     normals = surface.normals()
     tree = cKDTree((points @ e.axes - e.low) / e.edge)
-    away, which = tree.query(vertices, k=[1, 2, 3, 4, 5, 6], distance_upper_bound=3.0)
+    away, which = map(np.asarray, tree.query(vertices, k=[1, 2, 3, 4, 5, 6], distance_upper_bound=3.0))
     near = (away[:, 0] < _SEEN_CELLS) & np.isfinite(away).all(axis=1)
     middle = tree.data[np.where(np.isfinite(away), which, 0)].mean(axis=1)
     before, behind = (_is_free(e.free, vertices + side * normals, side * normals) for side in (1, -1))
-    seen = near & before
+    seen: NDArray[np.bool_] = near & before
     keep = np.where(behind, _HALF_SHELL_CELLS, 0.0)
     shift = np.clip(np.einsum("ij,ij->i", middle - vertices, normals) + keep, -1.0, 1.0)
     moved = vertices + _carried_on(vertices, normals, seen, shift)[:, None] * normals
     at = {tuple(c): n for n, c in enumerate(corners.tolist())}
 
     def place(cells: NDArray[np.int64]) -> Array:
-        places = cells - 0.5
+        places: Array = cells.astype(np.float64) - 0.5
         known = [(k, at[c]) for k, c in enumerate(map(tuple, cells.tolist())) if c in at]
         if known:
             which, of = np.array(known).T
             places[which] = moved[of]
         return e.world(places)
 
-    return ClosedSurface(e.world(moved), surface.faces), seen[surface.faces].all(axis=1), place
+    return ClosedSurface(e.world(moved), surface.faces), np.asarray(seen[surface.faces].all(axis=1)), place
 
 
 def _carried_on(vertices: Array, normals: Array, seen: NDArray[np.bool_], shift: Array) -> Array:
