@@ -48,9 +48,8 @@ _VOTERS = 400
 """as many as a keyframe has: few features that agree tell little."""
 _KEYFRAMES = 2000
 """Beyond this many, only the strongest features of a frame vote, so that a search takes no longer."""
-_CELLS, _ROWS, _PROBES, _NEIGHBOURS = 1024, 12, 4, 8
-"""Most inverted lists; least features of the first chunk for each; lists that are searched for a feature; stored
-features that it votes for."""
+_PROBES, _NEIGHBOURS = 4, 6
+"""Inverted lists that are searched for a feature; stored features that it votes for."""
 _OTHER = np.float32(0.1)
 """Least squared distance of a feature of something else, where all that are found are of one place."""
 
@@ -98,29 +97,30 @@ class Candidate:
 
 
 class FeatureIndex:
-    """SIFT features of the stored keyframes: inverted lists of cells round the first features."""
+    """SIFT features of the stored keyframes (`sift_rows`), in inverted lists, one for each pair of words.
+
+    The lists depend on no memory, so that equal memories give equal answers.
+    """
 
     def __init__(self) -> None:
+        import faiss
+
+        words = Vocabulary.built_in().words
+        pairs = _whole(_unit((words[:, None] + words)[np.triu_indices(len(words))]))
+        quantizer = faiss.IndexFlatL2(pairs.shape[1])
+        quantizer.add(pairs)
+        kind = faiss.ScalarQuantizer.QT_fp16
         self.keys: Ints = np.zeros((0, 2), np.int64)
         self._owner: Ints = np.zeros(0, np.int64)
-        self._index: Any = None
+        self._index: Any = faiss.IndexIVFScalarQuantizer(
+            quantizer, pairs.shape[1], len(pairs), kind, faiss.METRIC_L2, False
+        )
+        self._index.is_trained = True  # nothing is learned: half precision, and the lists are given
+        self._faiss: Any = faiss
 
     def add(self, keys: Ints, features: Sequence[Floats]) -> None:
         """Append rows: (chunk id, Frame.index) of shape (K, 2) and unit vectors (N, d) of each keyframe."""
-        import faiss
-
-        rows = np.concatenate(features)
-        if self._index is None:
-            count = min(_CELLS, 1 + len(rows) // _ROWS)
-            cells = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
-            quantizer = faiss.IndexFlatL2(rows.shape[1])
-            quantizer.add(cells)
-            kind = faiss.ScalarQuantizer.QT_fp16
-            self._index = faiss.IndexIVFScalarQuantizer(
-                quantizer, rows.shape[1], len(cells), kind, faiss.METRIC_L2, False
-            )
-            self._index.is_trained = True
-        self._index.add(rows)
+        self._index.add(np.concatenate(features))
         owner = np.repeat(np.arange(len(keys)) + len(self.keys), [len(f) for f in features])
         self._owner = np.concatenate([self._owner, owner])
         self.keys = np.concatenate([self.keys, keys])
@@ -128,14 +128,12 @@ class FeatureIndex:
     def search(self, frames: Sequence[Floats], allowed: NDArray[np.bool_], k: int) -> tuple[Ints, Floats]:
         """Return rows and votes of the k keyframes, allowed ones (Q, K), with most votes of each frame's features
         (N, d). (Q, k)."""
-        import faiss
-
         votes = np.zeros(allowed.shape, np.float32)
-        voters = max(_VOTERS // 8, min(_VOTERS, _VOTERS * _KEYFRAMES // len(self.keys)))
+        voters = max(_VOTERS // 8, min(_VOTERS, _VOTERS * _KEYFRAMES // max(1, int(allowed.any(axis=0).sum()))))
         for n, features in enumerate(frames):
             bitmap = np.packbits(allowed[n, self._owner], bitorder="little")
-            selector = faiss.IDSelectorBitmap(len(self._owner), faiss.swig_ptr(bitmap))
-            parameters: Any = faiss.SearchParametersIVF(sel=selector, nprobe=_PROBES)
+            selector = self._faiss.IDSelectorBitmap(len(self._owner), self._faiss.swig_ptr(bitmap))
+            parameters = self._faiss.SearchParametersIVF(sel=selector, nprobe=_PROBES)
             distance, row = self._index.search(features[:voters], _NEIGHBOURS + 1, params=parameters)
             distance = np.where(row >= 0, distance, 0.0)
             beyond = np.maximum(distance.max(axis=1, keepdims=True), _OTHER)
@@ -297,17 +295,20 @@ def _described(store: Store, chunk_id: int) -> _Described:
         return _Described(keys, (), 0)
     if descriptors.shape[1] in CLASSICAL:
         features = [store.keyframes.get(chunk_id, int(frame)).keypoint_descriptors for frame in keys[:, 1]]
-        if all(f.shape[1] == SIFT_WIDTH for f in features) and sum(map(len, features)):
+        if all(f.shape[1] == SIFT_WIDTH for f in features) and any(len(f) for f in features):
             return _Described(keys, sift_rows(features), 0)
     sound = np.where(np.isfinite(descriptors).all(axis=1, keepdims=True), descriptors, np.float32(0))
     return _Described(keys, _unit(np.asarray(sound, np.float32)), sound.shape[1])
 
 
 def sift_rows(features: Sequence[NDArray[np.uint8]]) -> list[Floats]:
-    """Return the SIFT descriptors (N, 128) of each frame as unit vectors (N, d) for `FeatureIndex`, d of whole words of
-    eight."""
-    reduced = [_unit(Vocabulary.built_in().reduced(root_sift(f))) for f in features]
-    return [np.pad(x, ((0, 0), (0, -x.shape[1] % 8))) for x in reduced]
+    """Return the SIFT descriptors (N, 128) of each frame as unit vectors (N, d) for `FeatureIndex`."""
+    return [_whole(_unit(Vocabulary.built_in().reduced(root_sift(f)))) for f in features]
+
+
+def _whole(rows: Floats) -> Floats:
+    """Return vectors with zeros appended to whole groups of eight, without which FAISS takes five times as long."""
+    return np.pad(rows, ((0, 0), (0, -rows.shape[1] % 8)))
 
 
 def _unit(vectors: Floats) -> Floats:
