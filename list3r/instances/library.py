@@ -60,7 +60,9 @@ def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposal
     keep = np.flatnonzero((proposals.score >= settings.min_score) & (area >= least))
     renumber = np.zeros(len(proposals.score) + 1, np.int32)
     renumber[keep + 1] = np.arange(1, len(keep) + 1)
-    of_each: dict[str, Any] = {n: value for n in _OF_EACH if (value := getattr(proposals, n)) is not None}
+    of_each = {n: value for n in _OF_EACH if (value := getattr(proposals, n)) is not None}
     rows = keep.tolist()
-    kept = {n: v[keep] if isinstance(v, np.ndarray) else tuple(v[k] for k in rows) for n, v in of_each.items()}
+    kept: dict[str, Any] = {
+        n: v[keep] if isinstance(v, np.ndarray) else tuple(v[k] for k in rows) for n, v in of_each.items()
+    }
     return replace(proposals, labels=renumber[proposals.labels], **kept)
