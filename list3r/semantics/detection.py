@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame, FrameSource
-from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.decoding.decode import decode_rgb
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.masks import decode_mask
@@ -139,9 +139,9 @@ def _pictures(
     """Frame.index and picture of the frames to look at, of the `own` ones (index to seconds)."""
     if source is None:
         for keyframe in store.keyframes.of(chunk.chunk_id):
-            image = decode_picture(keyframe.jpeg)
+            image = decode_rgb(keyframe.jpeg)
             if image is not None and keyframe.frame_index in own:
-                yield keyframe.frame_index, _fitting(np.asarray(image[..., ::-1]), chunk)
+                yield keyframe.frame_index, _fitting(image, chunk)
         return
     last = -np.inf
     positions = []

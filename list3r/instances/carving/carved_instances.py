@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.decoding.decode import decode_rgb
 from list3r.instances.carving.carved_surfaces import (
     Bools,
     CarvedSurfaces,
@@ -33,7 +33,7 @@ from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE
 from list3r.instances.tracking.reprojection import encode_labels, mask_track
 from list3r.memory.core.geometry import Array, Sim3
-from list3r.memory.core.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
+from list3r.memory.core.records import ChunkRow, FrameRow, LocalInstance, MaskTrack, Support
 from list3r.memory.library.overlap.visibility import DepthView, chunk_views
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.local_instances import LocalNode
@@ -75,7 +75,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         if not clusters:
             continue
         frames = [f for f in store.frames.all(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
-        pictures = [_picture(k) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
+        pictures = [decode_rgb(k.jpeg) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
         maker = _Maker(chunk, list(zip(own, pictures, strict=True)), frames, unit, upright, s)
         in_chunk = unit / float(chunk.S_world_chunk.scale)
         following = store.local_instances.next_id(chunk.chunk_id)
@@ -257,13 +257,6 @@ class _Maker:
         mask = np.zeros((height, width), bool)
         mask[row[inside], column[inside]] = True
         return _fill(mask)
-
-
-def _picture(keyframe: Keyframe) -> NDArray[np.uint8] | None:
-    if not keyframe.jpeg:
-        return None
-    decoded = decode_picture(keyframe.jpeg)
-    return None if decoded is None else np.asarray(decoded[:, :, ::-1], np.uint8)
 
 
 def _colors(picture: NDArray[np.uint8] | None, row: Ints, column: Ints, shape: tuple[int, ...]) -> NDArray[np.uint8]:
