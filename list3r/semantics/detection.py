@@ -194,7 +194,7 @@ def _seen(
 
 
 def _region(tracks: Mapping[int, MaskTrack]) -> NDArray[np.float32] | None:
-    """The part of the pictures in which the masks of a chunk lie: left, top, right, bottom, px. Shape (4,)."""
+    """The part of the pictures that holds the masks of a chunk: left, top, right, bottom, px. Shape (4,)."""
     boxes = [t.boxes_xyxy[t.areas_px > 0] for t in tracks.values() if (t.areas_px > 0).any()]
     if not boxes:
         return None

@@ -21,7 +21,7 @@ CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 CLIP_COSINE = 0.22
-"""CLIP's cosines of a picture with a fitting and with an unfitting phrase lie about this value."""
+"""CLIP's cosines of a picture with a fitting and with an unfitting phrase are about this value."""
 PROBABILITY = 0.05
 """SigLIP says itself how likely text and picture belong together; this is enough to be an answer."""
 WORDS = 64

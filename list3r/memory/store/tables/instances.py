@@ -73,7 +73,7 @@ _COLUMNS = Columns(
 
 @dataclass(frozen=True)
 class Ranks:
-    """What orders instances among those that words name equally well, and tells how large they are."""
+    """What orders instances that words name equally well, and their sizes."""
 
     ids: NDArray[np.int64]
     """Ascending. Shape (N,)."""
