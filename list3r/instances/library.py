@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from list3r.instances.tracking.movers import with_movers
 from list3r.instances.tracking.reprojection import ReprojectionTracker
 from list3r.memory.core.records import LocalLibrary
 from list3r.reconstruction.base import Reconstruction
+
+_OF_EACH = ("score", "features", "plane", "identity", "structure", "names", "whole", "named")
+"""Fields of `Proposals` that hold something of each candidate."""
 
 __all__ = ["InstanceSettings", "build_library", "select_prompts"]
 
@@ -56,15 +60,9 @@ def select_prompts(proposals: Proposals, settings: InstanceSettings) -> Proposal
     keep = np.flatnonzero((proposals.score >= settings.min_score) & (area >= least))
     renumber = np.zeros(len(proposals.score) + 1, np.int32)
     renumber[keep + 1] = np.arange(1, len(keep) + 1)
-    return replace(
-        proposals,
-        labels=renumber[proposals.labels],
-        score=proposals.score[keep],
-        features=proposals.features[keep],
-        plane=proposals.plane[keep],
-        identity=None if proposals.identity is None else proposals.identity[keep],
-        structure=None if proposals.structure is None else proposals.structure[keep],
-        names=None if proposals.names is None else tuple(proposals.names[k] for k in keep.tolist()),
-        whole=None if proposals.whole is None else proposals.whole[keep],
-        named=None if proposals.named is None else tuple(proposals.named[k] for k in keep.tolist()),
-    )
+    of_each = {n: value for n in _OF_EACH if (value := getattr(proposals, n)) is not None}
+    rows = keep.tolist()
+    kept: dict[str, Any] = {
+        n: v[keep] if isinstance(v, np.ndarray) else tuple(v[k] for k in rows) for n, v in of_each.items()
+    }
+    return replace(proposals, labels=renumber[proposals.labels], **kept)

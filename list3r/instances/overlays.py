@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from list3r.association.overlap.overlap_edge import MeasuredEdge
 from list3r.frames.base import Camera, Frame
-from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.decoding.decode import decode_rgb
 from list3r.memory.core.masks import decode_mask
 from list3r.memory.core.records import Keyframe, LocalLibrary
 from list3r.reconstruction.base import Reconstruction
@@ -96,7 +96,7 @@ def write_support(
     masks = [support.frame == frame for frame in shown]
     said = [(int((support.removed & m).sum()), int((support.kept & m).sum())) for m in masks]
     frame = shown[max(range(len(shown)), key=said.__getitem__)] if shown else -1
-    color = _decoded(pictures[frame]) if frame in pictures else None
+    color = decode_rgb(pictures[frame]) if frame in pictures else None
     if color is None or color.shape[:2] != (camera.height, camera.width):
         color = np.full((camera.height, camera.width, 3), 96, np.uint8)
     out = out_dir / "edges" / f"{name or f'{measured.edge.u}-{measured.edge.v}'}.png"
@@ -142,11 +142,6 @@ def _dots(
     for n in pixel.tolist():
         middle = (int((n % width + 0.5) * zoom), int((n // width + 0.5) * zoom))
         cv2.circle(image, middle, radius, color, -1, cv2.LINE_AA)
-
-
-def _decoded(jpeg: bytes) -> NDArray[np.uint8] | None:
-    image = decode_picture(jpeg)
-    return None if image is None else np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
 
 
 def _inner_point(mask: NDArray[np.bool_]) -> tuple[int, int]:

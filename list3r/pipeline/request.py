@@ -1,6 +1,6 @@
 """What a user asks of a build or an update: the arguments of Python and the options of the command line, written once.
 
-A field with help is an option of the commands; `list3r.cli.common.expanded` makes it from what stands here.
+A field with help is an option of the commands; `list3r.cli.common.expanded` makes it from its definition here.
 """
 
 from __future__ import annotations

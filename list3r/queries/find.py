@@ -208,7 +208,7 @@ def _reason(c: PhraseMatch) -> str:
 
 
 def _placed(store: Store, m: Match) -> Match:
-    """Return a match whose reason tells what holds it and when it was seen last."""
+    """Return a match whose reason says what holds it and when it was seen last."""
     i = m.instance
     held = [r for r in store.relations.all(i.id, None, None) if r.predicate in _HOLDING]
     room = room_of(store, i.id)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
@@ -61,101 +61,90 @@ def nearest(
         if point is None and instance_id is None:
             raise OptionError("a largest distance needs a point or an instance to measure from")
         max_distance = checked_length(max_distance, "max_distance")
-    origin = None if instance_id is None else checked_instance(store, instance_id)
-    place = None if point is None else checked_point(point, "point")
-    if words is None:
-        near = _near(store, origin, place, k, max_distance, Filters.of(store, options))
-        return Matches(_match(i, distance, "", origin, place) for distance, i in near)
+    asked = None
+    if instance_id is not None:
+        asked = _Origin.of_instance(store, checked_instance(store, instance_id))
+    elif point is not None:
+        asked = _Origin.of_point(store, checked_point(point, "point"))
+    if words is None and asked is not None:
+        near = _near(store, asked, k, max_distance, Filters.of(store, options))
+        return Matches(asked.match(i, distance) for distance, i in near)
+    assert words is not None
     from list3r.queries.find import named_by, only_common
 
     options["structure"] = options.get("structure", False) or not STRUCTURE.isdisjoint(wanted_words(words))
     filters = Filters.of(store, options)
-    if (origin is not None or place is not None) and only_common(store, words):
+    if asked is not None and only_common(store, words):
         filters = replace(filters, label=" ".join([*([filters.label] if filters.label else []), words]))
-        near = _near(store, origin, place, k, max_distance, filters)
-        return Matches(_match(i, distance, f"named {words}", origin, place) for distance, i in near)
+        near = _near(store, asked, k, max_distance, filters)
+        return Matches(asked.match(i, distance, f"named {words}") for distance, i in near)
     notes: list[str] = []
     named = named_by(store, words, filters, encoder, notes)
-    if origin is None and place is None:
+    if asked is None:
         ranked = sorted(named, key=lambda n: (-n[1], -n[0].confidence, n[0].id))
         best = (Match(i, round(score, 4), None, None, reason) for i, score, reason in ranked[:k])
         return Matches(best, notes, len(ranked))
-    bearing = [i for i, _, _ in named if origin is None or (i.id != origin.id and i.component == origin.component)]
+    bearing = [i for i, _, _ in named if i.id != asked.id and asked.component in (None, i.component)]
     reasons = {i.id: reason for i, _, reason in named}
-    found = _by_distance(bearing, _measure(store, origin, place), _aabb(origin, place), k, max_distance)
-    return Matches((_match(i, distance, reasons[i.id], origin, place) for distance, i in found), notes)
+    found = _by_distance(bearing, asked, k, max_distance)
+    return Matches((asked.match(i, distance, reasons[i.id]) for distance, i in found), notes)
 
 
-def _near(
-    store: Store,
-    origin: Instance | None,
-    place: NDArray[np.float64] | None,
-    k: int,
-    limit: float | None,
-    filters: Filters,
-) -> list[tuple[float, Instance]]:
+@dataclass(frozen=True)
+class _Origin:
+    """What answers are near to."""
+
+    place: NDArray[np.float64]
+    """World. Shape (3,)."""
+    aabb: NDArray[np.float64]
+    """Shape (2, 3)."""
+    name: str
+    measure: Callable[[Instance], float]
+    """Returns how far the surface of an instance is."""
+    touch: float = 0.0
+    """What is nearer than this touches it."""
+    id: int | None = None
+    component: int | None = None
+    """The only connected component that answers."""
+
+    @staticmethod
+    def of_instance(store: Store, i: Instance) -> _Origin:
+        """Return an instance as origin."""
+        touch = surface_of(store, i).spacing
+        return _Origin(i.center, i.aabb, f"#{i.id}", lambda o: distance_between(store, o, i), touch, i.id, i.component)
+
+    @staticmethod
+    def of_point(store: Store, place: NDArray[np.float64]) -> _Origin:
+        """Return a point as origin."""
+        return _Origin(place, np.array([place, place]), "the point", lambda o: distance_to_point(store, o, place))
+
+    def match(self, i: Instance, surface: float, named: str = "") -> Match:
+        """Return an answer, with its distance in words."""
+        offset = i.center - self.place
+        reason = f"from {self.name}" + (f", {named}" if named else "")
+        return Match(i, round(1.0 / (1.0 + surface), 4), surface, math.sqrt(offset.dot(offset)), reason)
+
+
+def _near(store: Store, o: _Origin, k: int, limit: float | None, filters: Filters) -> list[tuple[float, Instance]]:
     """Find the k nearest of all through the R*Tree."""
-    search = NearestSearch(
-        k,
-        _measure(store, origin, place),
-        filters,
-        leave_out=None if origin is None else origin.id,
-        component=filters.component if origin is None else origin.component,
-        limit=limit,
-        touch=0.0 if origin is None else surface_of(store, origin).spacing,
-    )
-    return nearest_first(store, _aabb(origin, place), search)
+    component = filters.component if o.component is None else o.component
+    search = NearestSearch(k, o.measure, filters, o.id, component, limit, o.touch)
+    return nearest_first(store, o.aabb, search)
 
 
 def _by_distance(
-    candidates: Sequence[Instance],
-    measure: Callable[[Instance], float],
-    aabb: NDArray[np.float64],
-    k: int,
-    limit: float | None,
+    candidates: Sequence[Instance], asked: _Origin, k: int, limit: float | None
 ) -> list[tuple[float, Instance]]:
     """Return the k nearest of some. Boxes bound the distance from below: only what can still win is measured."""
     if not candidates:
         return []
-    gaps = box_gaps(np.array([i.aabb for i in candidates]), aabb)
+    gaps = box_gaps(np.array([i.aabb for i in candidates]), asked.aabb)
     gaps -= STRAY * np.array([np.max(i.box.size) for i in candidates])
     found: list[tuple[float, int, Instance]] = []
     for n in np.argsort(gaps, kind="stable"):
         if len(found) >= k and gaps[n] > found[k - 1][0] + 1e-9:
             break
-        distance = measure(candidates[n])
+        distance = asked.measure(candidates[n])
         if limit is None or distance <= limit:
             found = sorted([*found, (distance, candidates[n].id, candidates[n])], key=lambda f: f[:2])[:k]
     return [(distance, i) for distance, _, i in found]
-
-
-def _aabb(origin: Instance | None, place: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return the box of what is asked about. Shape (2, 3)."""
-    if origin is not None:
-        return origin.aabb
-    assert place is not None
-    return np.array([place, place])
-
-
-def _measure(store: Store, origin: Instance | None, place: NDArray[np.float64] | None) -> Callable[[Instance], float]:
-    """Return the function that tells how far the surface of an instance is."""
-    if origin is not None:
-        known = origin
-        return lambda i: distance_between(store, i, known)
-    assert place is not None
-    point = place
-    return lambda i: distance_to_point(store, i, point)
-
-
-def _match(
-    i: Instance, surface: float, named: str, origin: Instance | None, place: NDArray[np.float64] | None
-) -> Match:
-    """Return an answer, with its distance in words."""
-    if origin is not None:
-        offset, reference = i.center - origin.center, f"from #{origin.id}"
-    else:
-        assert place is not None
-        offset, reference = i.center - place, "from the point"
-    center = math.sqrt(offset.dot(offset))
-    reason = reference + (f", {named}" if named else "")
-    return Match(i, round(1.0 / (1.0 + surface), 4), surface, center, reason)

@@ -25,7 +25,7 @@ VERTICAL = frozenset(("on", "supports", "in", "contains", "above", "below", "und
 ALL_PREDICATES = (*(p for p in PREDICATES if p != "between"), *VIEWPOINT, "between")
 
 _MOST_NAMED = 20_000
-"""Instances that words may stand for."""
+"""Instances that words may mean."""
 
 Place = int | str | Sequence[float] | PosedCamera
 """Where to look from: an instance's id, "camera" (where it was last), "camera:FRAME", a point x, y, z, or a camera."""
@@ -127,7 +127,7 @@ def _parse_place(store: Store, text: str) -> int | PosedCamera | list[float]:
 
 
 def _ids(store: Store, what: int | str | None, notes: list[str]) -> list[int] | None:
-    """Return the ids that a number or words stand for; None for whatever."""
+    """Return the ids that a number or words mean; None for whatever."""
     if what is None:
         return None
     if isinstance(what, str) and not re.fullmatch(r"#?[0-9]{1,30}", what):

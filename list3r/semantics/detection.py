@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Frame, FrameSource
-from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.decoding.decode import decode_rgb
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.masks import decode_mask
@@ -139,9 +139,9 @@ def _pictures(
     """Frame.index and picture of the frames to look at, of the `own` ones (index to seconds)."""
     if source is None:
         for keyframe in store.keyframes.of(chunk.chunk_id):
-            image = decode_picture(keyframe.jpeg)
+            image = decode_rgb(keyframe.jpeg)
             if image is not None and keyframe.frame_index in own:
-                yield keyframe.frame_index, _fitting(np.asarray(image[..., ::-1]), chunk)
+                yield keyframe.frame_index, _fitting(image, chunk)
         return
     last = -np.inf
     positions = []
@@ -194,7 +194,7 @@ def _seen(
 
 
 def _region(tracks: Mapping[int, MaskTrack]) -> NDArray[np.float32] | None:
-    """The part of the pictures in which the masks of a chunk lie: left, top, right, bottom, px. Shape (4,)."""
+    """The part of the pictures that holds the masks of a chunk: left, top, right, bottom, px. Shape (4,)."""
     boxes = [t.boxes_xyxy[t.areas_px > 0] for t in tracks.values() if (t.areas_px > 0).any()]
     if not boxes:
         return None

@@ -179,13 +179,14 @@ def _look(
     store: Store, chunk_id: int, wanted: list[_BestView], model: PictureEncoder, sums: dict[int, NDArray[np.float64]]
 ) -> None:
     """Add the vectors of one chunk's views to those of their things."""
-    from list3r.semantics.text_image import decode_jpeg, square_crop
+    from list3r.frames.decoding.decode import decode_rgb
+    from list3r.semantics.text_image import square_crop
 
     by_frame: dict[int, list[_BestView]] = defaultdict(list)
     for view in wanted:
         by_frame[view.frame].append(view)
     for frame, views in sorted(by_frame.items()):
-        picture = decode_jpeg(store.keyframes.get(chunk_id, frame).jpeg)
+        picture = decode_rgb(store.keyframes.get(chunk_id, frame).jpeg)
         if picture is None:
             continue
         vectors = model.encode_pictures([square_crop(picture, v.box) for v in views])

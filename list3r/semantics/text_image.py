@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.decoding.decode import decode_picture
 from list3r.frames.files import MAX_TEXT_BYTES, read_file
 from list3r.memory.core.errors import OptionError, first_line
 from list3r.memory.core.unpacking import parse_json
@@ -22,7 +21,7 @@ CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 CLIP_COSINE = 0.22
-"""CLIP's cosines of a picture with a fitting and with an unfitting phrase lie about this value."""
+"""CLIP's cosines of a picture with a fitting and with an unfitting phrase are about this value."""
 PROBABILITY = 0.05
 """SigLIP says itself how likely text and picture belong together; this is enough to be an answer."""
 WORDS = 64
@@ -109,12 +108,6 @@ def square_crop(picture: NDArray[np.uint8], box: Sequence[float], margin: float 
     if ys.start < ys.stop and xs.start < xs.stop:
         out[ys.start - top : ys.stop - top, xs.start - left : xs.stop - left] = picture[ys, xs]
     return out
-
-
-def decode_jpeg(data: bytes) -> NDArray[np.uint8] | None:
-    """The RGB picture (H, W, 3) of a JPEG, None when it is damaged."""
-    found = decode_picture(data)
-    return None if found is None else np.ascontiguousarray(found[..., ::-1])
 
 
 def load_tokenizer(folder: Path) -> Any:

@@ -260,7 +260,7 @@ class PageClouds:
         return min(times[1:])
 
     def _cloud(self, name: str, cloud: ShownCloud, shape: Any) -> None:
-        """Draw points as large as they lie apart, so that they close surfaces: a node for each step of size."""
+        """Draw points as large as they are apart, so that they close surfaces: a node for each step of size."""
         self._clear(name)
         if self._shown is None or not len(cloud.points):
             return

@@ -40,7 +40,7 @@ class ShownCloud:
     counts: NDArray[np.int64]
     """How many of the points are each instance's. Shape (K,)."""
     spacing: NDArray[np.float64]
-    """How far the points of each lie from each other, world units. Shape (K,)."""
+    """Distance of the points of each from each other, world units. Shape (K,)."""
 
     @property
     def owner(self) -> NDArray[np.int64]:
@@ -195,7 +195,7 @@ def colors(world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None
     else:
         each = np.array([color_of(world, n, mode) for n in cloud.ids.tolist()], np.uint8).reshape(-1, 3)
         out = np.repeat(each, cloud.counts, axis=0)
-        if mode == "changes":  # what is as it was keeps its light and shade, else nothing could be told in it
+        if mode == "changes":  # what is as it was keeps its light and shade, else no shape could be seen in it
             same = (out == UNCHANGED).all(axis=1)
             out[same] = (0.5 * cloud.rgb[same].mean(axis=1, keepdims=True) + 70).astype(np.uint8)
     if selected is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
-from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.decoding.decode import decode_rgb
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import Edge, FrameSamples, Keyframe
 
@@ -101,11 +101,8 @@ def compare(
 
 def _picture(keyframe: Keyframe, camera: Camera) -> tuple[Image, int]:
     """Return the keyframe's picture, at least 320 px wide, and its magnification."""
-    color = None
-    if keyframe.jpeg:
-        color = decode_picture(keyframe.jpeg)
+    color = decode_rgb(keyframe.jpeg)
     if color is None or color.shape[:2] != (camera.height, camera.width):
         color = np.full((camera.height, camera.width, 3), 96, np.uint8)
     zoom = max(1, round(320 / camera.width))
-    rgb = np.asarray(color[..., ::-1], np.uint8)
-    return np.ascontiguousarray(np.repeat(np.repeat(rgb, zoom, axis=0), zoom, axis=1)), zoom
+    return np.ascontiguousarray(np.repeat(np.repeat(color, zoom, axis=0), zoom, axis=1)), zoom

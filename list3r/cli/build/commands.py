@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -117,6 +119,7 @@ def demo(
     """
     from list3r.cli.build.demo import run_demo
 
-    report = run_demo(out, seed=seed, frames=frames, workers=workers, quiet=json)
+    with contextlib.redirect_stdout(io.StringIO()) if json else contextlib.nullcontext():
+        report = run_demo(out, seed=seed, frames=frames, workers=workers, quiet=json)
     if json:
         print_answer([report])

@@ -25,21 +25,21 @@ def run_demo(out: Path, *, seed: int, frames: int | None, workers: int | None, q
 
     make_folder(out)
     walk, memory = out / "walk", out / "rooms.l3r"
-    _print(quiet, f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
+    say(f"1. a simulated walk through two furnished rooms, seed {seed}: {walk}")
     _render(walk, seed=seed, frames=frames, workers=workers, quiet=quiet)
-    _print(quiet, f"\n2. list3r build {walk} -m {memory} --poses estimate")
+    say("", f"2. list3r build {walk} -m {memory} --poses estimate")
     from list3r.pipeline.build import build
 
     request, run = BuildRequest(poses="estimate"), RunOptions(workers=workers, resume=memory.exists())
     interrupted = build_interrupted(memory, run.resume)
     with watching("building", interrupted, quiet=quiet, notes=False) as watch:
         report = build(walk, memory, settings=request, run=run, watch=watch)
-    _print(quiet, "\n".join(report_lines(memory, report)))
+    say(*report_lines(memory, report))
     with open_memory(memory) as scene:
-        _ask(scene, memory, quiet)
-        written = _export(scene, out, quiet)
-        scores = _score(out, walk, quiet)
-    _print(quiet, f"\nA picture of the result: {written['plan']}")
+        _ask(scene, memory)
+        written = _export(scene, out)
+        scores = _score(out, walk)
+    say("", f"A picture of the result: {written['plan']}")
     return {"memory": str(memory), "walk": str(walk), "build": report.as_dict(), "exports": written, "scores": scores}
 
 
@@ -76,9 +76,7 @@ def _remove_unfinished(walk: Path) -> None:
         (walk / name).unlink(missing_ok=True)
 
 
-def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
-    if quiet:
-        return
+def _ask(scene: SceneMemory, memory: Path) -> None:
     objects = scene.instances()
     names = {i.id: i.label or i.description for i in scene.instances(structure=None)}
     say("", f"3. list3r list {memory}")
@@ -94,18 +92,18 @@ def _ask(scene: SceneMemory, memory: Path, quiet: bool) -> None:
     print_table([[m.instance.id, names[m.instance.id], m.distance_m] for m in matches], ["id", "what", "surface (m)"])
 
 
-def _export(scene: SceneMemory, out: Path, quiet: bool) -> dict[str, str]:
-    _print(quiet, "\n6. exports")
+def _export(scene: SceneMemory, out: Path) -> dict[str, str]:
+    say("", "6. exports")
     written = {}
     for name, suffix in EXPORTS:
         path = out / f"rooms.{suffix}"
         scene.export(name, path)
         written[name] = str(path)
-        _print(quiet, f"   {name:5} {path}  {path.stat().st_size / 1e6:.2f} MB")
+        say(f"   {name:5} {path}  {path.stat().st_size / 1e6:.2f} MB")
     return written
 
 
-def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
+def _score(out: Path, walk: Path) -> dict[str, Any]:
     """The truth of a simulated walk is known, so say how far the memory is from it."""
     from list3r.evaluation.scene import alignment_of, evaluate_scene, read_scene
     from list3r.evaluation.trajectory import evaluate_trajectory, read_tum
@@ -114,13 +112,7 @@ def _score(out: Path, walk: Path, quiet: bool) -> dict[str, Any]:
     errors = evaluate_trajectory(truth, estimate)
     S_truth_scene = alignment_of(truth, estimate, with_scale=False)
     scene = evaluate_scene(read_scene(out / "rooms.json"), read_scene(walk / "truth.json"), S_truth_scene)
-    _print(quiet, "\n7. against the known truth")
-    if not quiet:
-        say(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
-        print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
+    say("", "7. against the known truth")
+    say(f"   camera    {errors.ate_se3_m.rmse * 100:.1f} cm RMSE over {errors.pairs} frames, SE(3) alignment")
+    print_table([["  ", *row] for row in score_rows(scene)], ["", "", "recall", "precision", ""])
     return {"trajectory": errors.as_dict(), "scene": scene}
-
-
-def _print(quiet: bool, text: str) -> None:
-    if not quiet:
-        say(*text.splitlines())

@@ -153,6 +153,12 @@ def decode_picture(data: bytes, flags: int = cv2.IMREAD_COLOR, name: str = "the 
     return None if image is None else np.asarray(image)
 
 
+def decode_rgb(data: bytes) -> NDArray[np.uint8] | None:
+    """Return a picture as RGB (H, W, 3), None where it is damaged or none is there. Raises `FrameError`."""
+    image = decode_picture(data)
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
 def _fault(data: bytes) -> str:
     """Return whether a JPEG or PNG is cut off or a PNG damaged, by its own sums; empty where it is not.
 

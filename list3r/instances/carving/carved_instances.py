@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from list3r.frames.decoding.decode import decode_picture
+from list3r.frames.decoding.decode import decode_rgb
 from list3r.instances.carving.carved_surfaces import (
     Bools,
     CarvedSurfaces,
@@ -31,9 +31,9 @@ from list3r.instances.carving.carved_surfaces import (
 from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE
+from list3r.instances.tracking.reprojection import encode_labels, mask_track
 from list3r.memory.core.geometry import Array, Sim3
-from list3r.memory.core.masks import encode_mask
-from list3r.memory.core.records import ChunkRow, FrameRow, Keyframe, LocalInstance, MaskTrack, Support
+from list3r.memory.core.records import ChunkRow, FrameRow, LocalInstance, MaskTrack, Support
 from list3r.memory.library.overlap.visibility import DepthView, chunk_views
 from list3r.memory.store.store import Store
 from list3r.memory.store.tables.local_instances import LocalNode
@@ -75,7 +75,7 @@ def add_changed_places(store: Store, session_id: int, settings: ChangedPlaceSett
         if not clusters:
             continue
         frames = [f for f in store.frames.all(chunk.session_id) if f.chunk_id == chunk.chunk_id and f.state == "posed"]
-        pictures = [_picture(k) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
+        pictures = [decode_rgb(k.jpeg) for k in keyframes[chunk.chunk_id] if k.depth_small.size]
         maker = _Maker(chunk, list(zip(own, pictures, strict=True)), frames, unit, upright, s)
         in_chunk = unit / float(chunk.S_world_chunk.scale)
         following = store.local_instances.next_id(chunk.chunk_id)
@@ -232,7 +232,6 @@ class _Maker:
         """Masks in the keyframes, and by projection in the frames between two of them."""
         size = self._chunk.image_size
         full = {k: _fill(_enlarge(m, size)) for k, m in masks.items()}
-        order = sorted(full)
         keys = sorted(v.frame_index for v, _ in self._shown)
         for f in self._frames:
             n = int(np.searchsorted(keys, f.frame_index))
@@ -241,19 +240,10 @@ class _Maker:
                 mask = self._projected(support.points, f)
                 if mask.any():
                     full[f.frame_index] = mask
-        order = sorted(full)
-        places = [np.nonzero(full[k]) for k in order]
-        boxes = [[c.min(), r.min(), c.max() + 1, r.max() + 1] for r, c in places]
-        areas = np.array([len(r) for r, _ in places], np.int32)
-        return MaskTrack(
-            frames=np.array(order, np.int64),
-            boxes_xyxy=np.array(boxes, np.float32),
-            centers_xy=np.array([[c.mean(), r.mean()] for r, c in places], np.float32),
-            areas_px=areas,
-            visible_fraction=np.minimum(1.0, areas / max(float(np.quantile(areas, 0.9)), 1.0)).astype(np.float32),
-            masks=tuple(encode_mask(full[k]) for k in order),
-            image_size=size,
-        )
+        coded = {k: encode_labels(mask.astype(np.int32), 1, size)[0] for k, mask in sorted(full.items())}
+        areas = np.array([m.area for m in coded.values()])
+        visible = np.minimum(1.0, areas / max(float(np.quantile(areas, 0.9)), 1.0))
+        return mask_track(list(coded), list(coded.values()), visible, size)
 
     def _projected(self, points: NDArray[np.float32], frame: FrameRow) -> Bools:
         """Mask of surface points in a frame between keyframes."""
@@ -267,13 +257,6 @@ class _Maker:
         mask = np.zeros((height, width), bool)
         mask[row[inside], column[inside]] = True
         return _fill(mask)
-
-
-def _picture(keyframe: Keyframe) -> NDArray[np.uint8] | None:
-    if not keyframe.jpeg:
-        return None
-    decoded = decode_picture(keyframe.jpeg)
-    return None if decoded is None else np.asarray(decoded[:, :, ::-1], np.uint8)
 
 
 def _colors(picture: NDArray[np.uint8] | None, row: Ints, column: Ints, shape: tuple[int, ...]) -> NDArray[np.uint8]:

@@ -11,7 +11,7 @@ from list3r.instances.base import Proposals
 from list3r.instances.geometric.support import collect_supports
 from list3r.instances.geometric.views import ChunkViews
 from list3r.instances.settings import InstanceSettings
-from list3r.instances.tracking.reprojection import LabelledChunk
+from list3r.instances.tracking.reprojection import LabelledChunk, mask_track
 from list3r.memory.core.records import LocalInstance
 
 
@@ -37,6 +37,6 @@ def low_confidence_instances(
     out: list[LocalInstance] = []
     for number, (track, support) in enumerate(zip(tracks, supports, strict=True)):
         if len(track.frames) >= least and len(support.points) >= s.least_points:
-            seen = track.record((camera.height, camera.width))
+            seen = mask_track(track.frames, track.masks, track.visible, (camera.height, camera.width))
             out.append(LocalInstance(first_id + len(out), seen, feature[number], support, whole[number]))
     return tuple(out)

@@ -13,7 +13,7 @@ from list3r.instances.geometric.features import object_feature
 from list3r.instances.geometric.fusion import small_color
 from list3r.instances.geometric.support import thin
 from list3r.instances.settings import FEATURE_SPACE, MoverInstanceSettings
-from list3r.instances.tracking.reprojection import encode_labels
+from list3r.instances.tracking.reprojection import encode_labels, mask_track
 from list3r.memory.core.records import LocalInstance, LocalLibrary, MaskTrack, MotionTrack, Support
 from list3r.reconstruction.base import Reconstruction, backproject
 from list3r.reconstruction.motion.free_space import SmallFrames
@@ -82,18 +82,10 @@ def _instance(
 
 def _mask_track(blobs: Sequence[Blob], reconstruction: Reconstruction, small: SmallFrames) -> MaskTrack:
     size = (reconstruction.camera.height, reconstruction.camera.width)
-    codes = [encode_labels(b.mask.astype(np.int32), small.stride, size)[0] for b in blobs]
-    areas = np.array([area for _, area, _, _ in codes], np.int32)
-    metric = areas * np.array([(b.low[2] + b.high[2]) ** 2 for b in blobs])
-    return MaskTrack(
-        frames=reconstruction.frame_indices[[b.position for b in blobs]].astype(np.int64),
-        boxes_xyxy=np.array([box for _, _, box, _ in codes], np.float32),
-        centers_xy=np.array([center for _, _, _, center in codes], np.float32),
-        areas_px=areas,
-        visible_fraction=np.clip(metric / max(float(np.quantile(metric, 0.9)), 1e-9), 0.0, 1.0).astype(np.float32),
-        masks=tuple(mask for mask, _, _, _ in codes),
-        image_size=size,
-    )
+    masks = [encode_labels(b.mask.astype(np.int32), small.stride, size)[0] for b in blobs]
+    metric = np.array([m.area * (b.low[2] + b.high[2]) ** 2 for m, b in zip(masks, blobs, strict=True)])
+    visible = np.clip(metric / max(float(np.quantile(metric, 0.9)), 1e-9), 0.0, 1.0)
+    return mask_track(reconstruction.frame_indices[[b.position for b in blobs]], masks, visible, size)
 
 
 def _support(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from list3r.compiled import compiled
 from list3r.frames.base import Frame
@@ -28,29 +29,37 @@ SAMPLES = 150
 """Support points of an instance that are projected into every frame."""
 
 
+class CodedMask(NamedTuple):
+    """One instance in one frame, at the size of the colour image."""
+
+    runs: NDArray[np.uint32]
+    area: int
+    box: tuple[float, float, float, float]
+    center: tuple[float, float]
+
+
 @dataclass
 class GrowingTrack:
     """The growing track of one instance."""
 
     frames: list[int] = field(default_factory=list)
-    boxes: list[tuple[float, float, float, float]] = field(default_factory=list)
-    centers: list[tuple[float, float]] = field(default_factory=list)
-    areas: list[int] = field(default_factory=list)
+    masks: list[CodedMask] = field(default_factory=list)
     visible: list[float] = field(default_factory=list)
     agreement: list[float] = field(default_factory=list)
-    masks: list[NDArray[np.uint32]] = field(default_factory=list)
 
-    def record(self, size: tuple[int, int]) -> MaskTrack:
-        """Return the track as it is kept; `size` is (height, width) of the masks."""
-        return MaskTrack(
-            np.array(self.frames, np.int64),
-            np.array(self.boxes, np.float32),
-            np.array(self.centers, np.float32),
-            np.array(self.areas, np.int32),
-            np.array(self.visible, np.float32),
-            tuple(self.masks),
-            size,
-        )
+
+def mask_track(frames: ArrayLike, masks: Sequence[CodedMask], visible: ArrayLike, size: tuple[int, int]) -> MaskTrack:
+    """Return a track as it is kept: `size` is (height, width) of its masks."""
+    runs, areas, boxes, centers = zip(*masks, strict=True)
+    return MaskTrack(
+        np.array(frames, np.int64),
+        np.array(boxes, np.float32),
+        np.array(centers, np.float32),
+        np.array(areas, np.int32),
+        np.array(visible, np.float32),
+        runs,
+        size,
+    )
 
 
 class ReprojectionTracker:
@@ -111,17 +120,14 @@ class LabelledChunk:
             labels = labels_of(position)
             seen, hit = _look_for(views, position, labels, samples, owner=owner, count=len(supports))
             runs = encode_labels(labels, views.stride, (camera.height, camera.width))
-            for instance, (mask, area, box, center) in runs.items():
-                if area < min_area:
+            for instance, mask in runs.items():
+                if mask.area < min_area:
                     continue
                 track = tracks[instance]
                 track.frames.append(int(views.reconstruction.frame_indices[position]))
-                track.boxes.append(box)
-                track.centers.append(center)
-                track.areas.append(area)
+                track.masks.append(mask)
                 track.visible.append(float(seen[instance]))
                 track.agreement.append(float(hit[instance]))
-                track.masks.append(mask)
         return tracks
 
     def _library(self, tracks: Sequence[GrowingTrack], feature_space: str) -> LocalLibrary:
@@ -138,8 +144,8 @@ class LabelledChunk:
             seen = _SeenViews([(p, n) for p, owner in found for n in np.flatnonzero(owner == number).tolist()])
             plane, structure = seen.surface(views)
             stability *= 1.0 if structure else seen.whole()
-            record, own = track.record(size), seen.feature()
-            instance = LocalInstance(len(instances), record, own, support, stability, plane, structure)
+            record = mask_track(track.frames, track.masks, track.visible, size)
+            instance = LocalInstance(len(instances), record, seen.feature(), support, stability, plane, structure)
             if not structure:
                 instance = replace(instance, names=seen.names(), named=seen.named())
             instances.append(instance)
@@ -184,10 +190,8 @@ def _tidy(labels: NDArray[np.int32], depth: NDArray[np.float32]) -> NDArray[np.i
     return np.where(grow, most, kept).astype(np.int32)
 
 
-def encode_labels(
-    labels: NDArray[np.int32], stride: int, shape: tuple[int, int]
-) -> dict[int, tuple[NDArray[np.uint32], int, tuple[float, float, float, float], tuple[float, float]]]:
-    """Run-length code, area, box and centroid of every instance of a label image, at the colour image's size."""
+def encode_labels(labels: NDArray[np.int32], stride: int, shape: tuple[int, int]) -> dict[int, CodedMask]:
+    """Every instance of a label image, at the colour image's size."""
     starts, stops, value = label_runs(np.ascontiguousarray(labels, np.int32), stride, *shape)
     order = np.argsort(value, kind="stable")
     starts, stops, value = starts[order], stops[order], value[order]
@@ -195,7 +199,8 @@ def encode_labels(
     runs, ends, figures = _codes(starts, stops, bounds, *shape)
     out = {}
     for k, (area, x0, y0, x1, y1, x, y) in enumerate(figures.tolist()):
-        out[int(value[bounds[k]]) - 1] = runs[ends[k] : ends[k + 1]], int(area), (x0, y0, x1, y1), (x, y)
+        mask = CodedMask(runs[ends[k] : ends[k + 1]], int(area), (x0, y0, x1, y1), (x, y))
+        out[int(value[bounds[k]]) - 1] = mask
     return out
 
 

@@ -200,8 +200,8 @@ class Constraints:
     ) -> tuple[list[list[Key]], dict[Key, T]]:
         """Return the groups with those joined that must be linked, and what is known of them by their first member.
 
-        `components` by chunk id: what lies in two connected components cannot be one instance yet. Of several groups
-        that come together the last one of which anything is known tells.
+        `components` by chunk id: instances of two connected components cannot be one yet. Of several groups
+        that come together the last known one counts.
         """
         from scipy.cluster.hierarchy import DisjointSet
 

@@ -17,7 +17,7 @@ from list3r.memory.library.scene import Scene
 from list3r.memory.library.uncertainty import position_sigmas
 
 _COMPARED = 12
-"""Chunks with which a new one is compared: those that saw most of the instances that lie where it looked."""
+"""A new chunk is compared with the chunks that saw most of the instances in its view."""
 
 
 def attach(scene: Scene, chunk_id: int) -> ConsolidationReport:
@@ -44,7 +44,7 @@ def attach(scene: Scene, chunk_id: int) -> ConsolidationReport:
 
 
 def _near(scene: Scene, chunk_id: int) -> list[int]:
-    """Return the chunk and those that saw the instances that lie where it looked, in order."""
+    """Return the chunk and the chunks that saw the instances in its view, in order."""
     low, high = scene.extent(chunk_id)
     if not np.isfinite(low).all():
         return [chunk_id]

@@ -1,6 +1,6 @@
 """Local instances of all chunks to the global library (paper 3.3): group, keep ids, derive, relate, log.
 
-The library is derived whole, as a function of the chunks and of where they lie (`library.derivation`): with each of the
+The library is derived whole, as a function of the chunks and of their poses (`library.derivation`): with each of the
 first chunks, whenever they have grown by a quarter, and when a session ends. In between, what a new chunk saw comes to
 the instances by overlap alone (`library.attaching`).
 """
@@ -27,8 +27,8 @@ def consolidate(
 ) -> ConsolidationReport:
     """Bring the library up to date with the chunks as they are placed now; call inside a transaction.
 
-    `chunk_id` is the chunk that has just come in and names the entries of the merge log. None stands for the last one
-    and for the end of a session, whose changes are found. The result depends on what the store holds alone, so a build
+    `chunk_id` is the chunk that has just come in and names the entries of the merge log. None means the last one
+    and the end of a session, whose changes are found. The result depends on what the store holds alone, so a build
     that goes on after a crash comes to the same library.
     """
     s, chunks = settings_of(store, settings), store.chunks.all()

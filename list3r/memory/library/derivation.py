@@ -1,4 +1,4 @@
-"""The library of a memory (paper 3.3), derived from what chunks saw and where they lie.
+"""The library of a memory (paper 3.3), derived from what chunks saw and from their poses.
 
 `derive` is a function: of the chunks with their poses, of the edits of operators, and, for ids alone, of who was who.
 It is the same whenever and however often it is called, and depends on nothing that was derived before. What takes most
@@ -65,7 +65,7 @@ class Library:
 
 
 def derive(scene: Scene, known: Known, *, ended: bool) -> Library:
-    """Derive the library; `ended` says that the last session has, so that it is told what that has changed."""
+    """Derive the library; `ended` says that the last session has, so that its changes are found."""
     formed = form(scene, ended=ended)
     changes, weighed = formed.changes, formed.weighed
     ids = _named(scene, formed, known)

@@ -17,7 +17,7 @@ class Identities:
     new: tuple[int, ...]
     """Ids given for the first time."""
     aliases: tuple[tuple[int, int], ...]
-    """(id that retires, id that stands for it now)."""
+    """(id that retires, id that it resolves to now)."""
     splits: tuple[tuple[int, int], ...]
     """(id that was split, id of a part that left it)."""
     last_id: int
@@ -37,7 +37,7 @@ def assign_ids(
     An id goes on with the group that holds most (by `weights`) of what it named before; where several ids come to one
     group the oldest stays and the others become aliases. Parts that left an id, and groups never seen, get new ids in
     the order of the groups; ids are never used again. A group that is not `shown` has no id; one that it had becomes an
-    alias of the group that it lies `within`, and it stays shown where there is none.
+    alias of the group that it is `within`, and it stays shown where there is none.
     """
     visible = [s or w is None for s, w in zip(shown, within, strict=True)]
     share: dict[int, dict[int, int]] = {}

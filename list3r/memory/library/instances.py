@@ -72,7 +72,7 @@ class DerivedInstance:
 
     geometry: InstanceGeometry
     box: OrientedBox
-    """The box that is told; that of its geometry, by which it is related to others, holds all of its points."""
+    """The box that is reported; the box of its geometry, for relations, holds all of its points."""
     feature: NDArray[np.float32]
     """Unit length. Shape (D,)."""
     frames: NDArray[np.int64]
@@ -85,7 +85,7 @@ class DerivedInstance:
     dynamic: bool = False
     """Whether it was seen moving; its geometry is then where it was last."""
     resting: bool = True
-    """Whether it stands still there, so that it has relations."""
+    """Whether it is still there, so that it has relations."""
 
 
 def derived_instance(
@@ -118,7 +118,7 @@ def derived_instance(
     counts = np.array([m.shapes.seen_for(m.at) for m in members], dtype=np.float64)
     feature = np.average([m.shapes.feature[m.at] for m in members], axis=0, weights=np.maximum(counts, 1))
     box = fit_box(points, upright=upright, trim=s.trim)
-    told = _agreed_box(box, points, owner, members, s, upright=upright)
+    agreed = _agreed_box(box, points, owner, members, s, upright=upright)
     geometry = InstanceGeometry(
         id=instance_id,
         points=points,
@@ -133,7 +133,7 @@ def derived_instance(
     shape = shape_word((points - box.center) @ box.rotation, box.size, _metre(members))
     colors = dominant_colors(rgb)
     view = _best_view(members, s)
-    return DerivedInstance(geometry, told, unit_feature, frames, view, shape, colors)
+    return DerivedInstance(geometry, agreed, unit_feature, frames, view, shape, colors)
 
 
 def _frames(members: Sequence[Member]) -> NDArray[np.int64]:

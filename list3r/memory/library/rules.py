@@ -93,7 +93,7 @@ class ConsolidationReport:
 
 
 def look_at_world(store: Store, chunks: list[ChunkRow], summaries: Summaries, s: ConsolidationSettings) -> World:
-    """Return what holds for the whole memory now; a sample of at most 64 chunks tells."""
+    """Return what holds for the whole memory now; by a sample of at most 64 chunks."""
     first = min(c.component for c in chunks)
     upright = _upright(store)
     inside = [c for c in chunks if c.component == first]

@@ -1,4 +1,4 @@
-"""The chunks of a memory where they lie, as one derivation sees them: each read once, when first asked for."""
+"""The placed chunks of a memory, as one derivation sees them: each read once, when first asked for."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from list3r.memory.library.world.world import World
 from list3r.memory.store.store import Store
 
 _FAR_M = 0.5
-"""Chunks whose points lie further apart than this share no instance."""
+"""Chunks whose points are further apart than this share no instance."""
 
 
 class Scene:
-    """What chunks saw, and where they lie."""
+    """What chunks saw, and their poses."""
 
     def __init__(self, store: Store, summaries: Summaries, world: World, settings: ConsolidationSettings) -> None:
         self.store, self.world, self.settings = store, world, settings
@@ -78,7 +78,7 @@ class Scene:
 
     @cached_property
     def near(self) -> Mapping[int, list[int]]:
-        """The chunks of one component that lie near each, itself among them, in order."""
+        """The chunks of one component near each, itself among them, in order."""
         ids, extents = list(self.rows), np.array([self.extent(k) for k in self.rows])
         part = np.array([c.component for c in self.rows.values()])
         out = {}
@@ -89,7 +89,7 @@ class Scene:
         return out
 
     def extent(self, chunk_id: int) -> Array:
-        """Return the box round a chunk's points in the world, grown by half of what lies near. Shape (2, 3)."""
+        """Return the box round a chunk's points in the world, grown by half of `_FAR_M`. Shape (2, 3)."""
         summary, S_world_chunk = self.summaries[chunk_id], self.pose(chunk_id)
         points = summary.shapes.points
         if len(points) == 0:
@@ -99,7 +99,7 @@ class Scene:
         return np.stack([p.min(axis=0) - slack, p.max(axis=0) + slack])
 
     def pairs(self, among: Collection[int]) -> list[Pair]:
-        """Return the pairs (u <= v) of some chunks that lie near each other."""
+        """Return the pairs (u <= v) of some chunks that are near each other."""
         return [(u, v) for u in sorted(among) for v in self.near[u] if v >= u and v in among]
 
     def overlaps(self, pairs: Iterable[Pair], left_out: Collection[Key] = ()) -> dict[Pair, PairScores]:

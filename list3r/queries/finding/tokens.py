@@ -62,7 +62,7 @@ def openings(name: str) -> frozenset[tuple[str, ...]]:
 
 
 def text_words(text: str) -> list[str]:
-    """Return words as they stand, short forms in full; what is written without spaces comes apart at known nouns."""
+    """Return the words of a text, short forms in full; what is written without spaces comes apart at known nouns."""
     text = re.sub(r"[’`]", "'", text.lower())
     text = re.sub(r"n't\b", " not", text.replace("can't", "can not").replace("cannot", "can not"))
     text = re.sub(r"\b(what|where|who|which|that|there|it|how|here)'s\b", r"\1 is", text).replace("i'm ", "i am ")
@@ -142,7 +142,7 @@ def _token_at(words: list[str], k: int) -> tuple[int, Token]:
 
 
 def _meant(part: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the nouns that words mean: as they stand, singular, without accents, or without a German plural's end."""
+    """Return the nouns that words mean: unchanged, singular, without accents, or without a German plural's end."""
     known = names()
     found = (*known.get(part, ()), *known.get(tuple(split_words(" ".join(part))), ()))
     if not found and len(part) == 1 and len(part[0]) > 4 and split_words(part[0]) == [part[0]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +47,7 @@ def camera_of_frame(store: Store, frame: int, session: int | None = None) -> Pos
 
     Raises `OptionError` for a frame that is not there or has no pose, with the nearest one that has.
     """
-    rows = [f for f in store.frames.all(_checked_session(store, session)) if f.state == "posed"]
+    rows = _posed(store, session)
     found = [f for f in rows if f.frame_index == frame]
     if not found:
         near = min(rows, key=lambda f: abs(f.frame_index - frame), default=None)
@@ -67,7 +67,7 @@ def camera_at_time(store: Store, time_s: float, session: int | None = None) -> P
     """Return the camera of the posed frame nearest to a time, seconds of the source's clock. Raises `OptionError`."""
     if not np.isfinite(time_s):
         raise OptionError(f"time {time_s} must be a finite number of seconds")
-    rows = [f for f in store.frames.all(_checked_session(store, session)) if f.state == "posed"]
+    rows = _posed(store, session)
     if not rows:
         raise OptionError(f"{store.path} has no frame with a pose")
     return _camera(store, min(rows, key=lambda f: (abs(f.time_s - time_s), f.session_id, f.frame_index)))
@@ -90,7 +90,9 @@ def camera_at_pose(
         raise OptionError(f"quat must be four numbers w, x, y, z, not {quat_wxyz!r}") from error
     if quat.shape != (4,) or not np.isfinite(quat).all() or not 1e-9 < np.abs(quat).max() < 1e9:
         raise OptionError(f"quat must be four finite numbers w, x, y, z, not all zero, not {str(quat.tolist())[:80]}")
-    chunks = store.chunks.all(_checked_session(store, session))
+    if session is not None:
+        store.sessions.check(session)
+    chunks = store.chunks.all(session)
     if not chunks:
         raise OptionError(f"{store.path} has no camera yet; give it a video first")
     pose = np.eye(4)
@@ -101,20 +103,21 @@ def camera_at_pose(
 
 def last_camera(store: Store, session: int | None = None) -> PosedCamera:
     """Return where the camera was last. Raises `OptionError` when no frame has a pose."""
-    rows = [f for f in store.frames.all(_checked_session(store, session)) if f.state == "posed"]
+    rows = _posed(store, session)
     if not rows:
         raise OptionError(f"{store.path} has no frame with a pose to look from")
     return _camera(store, rows[-1])
 
 
-def _checked_session(store: Store, session: int | None) -> int | None:
+def _posed(store: Store, session: int | None) -> list[FrameRow]:
+    """Return the posed frames of a session, or of all. Raises `OptionError` for a session that there is not."""
     if session is not None:
         store.sessions.check(session)
-    return session
+    return [f for f in store.frames.all(session) if f.state == "posed"]
 
 
 def _camera(store: Store, frame: FrameRow) -> PosedCamera:
-    return _camera_in(_chunk_of(store.chunks.all(frame.session_id), frame), frame)
+    return _camera_in(store.chunks.get(frame.chunk_id), frame)
 
 
 def _camera_in(chunk: ChunkRow, frame: FrameRow) -> PosedCamera:
@@ -122,12 +125,3 @@ def _camera_in(chunk: ChunkRow, frame: FrameRow) -> PosedCamera:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = S_world_cam.rotation, S_world_cam.translation
     return PosedCamera(pose, chunk.intrinsics, chunk.image_size, chunk.component, frame.session_id, frame)
-
-
-def _chunk_of(chunks: Sequence[ChunkRow], frame: FrameRow) -> ChunkRow:
-    found = next((c for c in chunks if c.chunk_id == frame.chunk_id), None)
-    if found is None:
-        raise OptionError(
-            f"frame {frame.frame_index} belongs to a chunk that is not in the memory; run `list3r verify`"
-        )
-    return found

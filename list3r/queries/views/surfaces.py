@@ -19,7 +19,7 @@ from list3r.memory.store.store import Store
 _MAX_POINTS = 4000
 """More points of one instance are thinned out: that is finer than the surfaces are known."""
 STRAY = 2e-5
-"""Points may lie this far outside their thing's box, by its size: the steps in which they are stored."""
+"""Points may be this far outside their instance's box, by its size: the steps in which they are stored."""
 _SLACK = 0.02
 """Points this far outside of the box, as a share of its longest edge, still count as the instance's surface."""
 _READ = 50
@@ -54,7 +54,7 @@ class InstanceSurface:
 
     @cached_property
     def spacing(self) -> float:
-        """How far the points lie from each other: what is nearer than that touches, as far as is known."""
+        """Distance of the points from each other: what is nearer than that touches, as far as is known."""
         if self.support is None or len(self.support) < 9:
             return 0.0
         sample = self.points[:: -(-len(self.points) // 200)]
@@ -62,7 +62,7 @@ class InstanceSurface:
 
 
 class SurfaceCache(LruCache[tuple[int, bytes], InstanceSurface]):
-    """Surfaces by instance id and what tells that the instance is as it was."""
+    """Surfaces by instance id and what shows that the instance is unchanged."""
 
     def __init__(self) -> None:
         super().__init__(_KEPT_POINTS, lambda surface: surface.weight)
@@ -101,7 +101,7 @@ def _surface(measured: NDArray[np.float32] | None, instance: Instance) -> Instan
 
 
 def inside_box(points: NDArray[np.floating[Any]], instance: Instance) -> NDArray[np.bool_]:
-    """Tell which points lie in the box of an instance, or just outside. Shape (N, 3) -> (N,)."""
+    """Tell which points are in the box of an instance, or just outside. Shape (N, 3) -> (N,)."""
     slack = _SLACK * float(np.max(instance.box.size)) + 1e-9
     low, high = instance.aabb
     return np.asarray(np.all((points >= low - slack) & (points <= high + slack), axis=1))
@@ -134,14 +134,14 @@ def distance_to_point(store: Store, instance: Instance, point: NDArray[np.float6
 
 
 def _squared(x: float, y: float, z: float) -> float:
-    """Return square of a distance by how far a point lies outside along three axes, not above 0 where it does not."""
+    """Return square of a distance by how far a point is outside along three axes, not above 0 where it does not."""
     x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
     return x**2 + y**2 + z**2
 
 
 def distance_between(store: Store, a: Instance, b: Instance) -> float:
     """Measure between the nearest surface points of two instances; 0 where they touch, which is where the points of one
-    lie as near to the other as to each other.
+    are as near to the other as to each other.
     """
     one, two = surface_of(store, a), surface_of(store, b)
     small, large = sorted((one, two), key=lambda s: len(s.points))

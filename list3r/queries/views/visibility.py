@@ -1,7 +1,7 @@
-"""Render what a camera would see: supports projected into its picture, each hidden by what lies before it.
+"""Render what a camera would see: supports projected into its picture, each hidden by what is before it.
 
 The picture is a depth buffer at a fraction of the image's size. Every surface point covers a square as wide as its
-thing's points lie apart, so that surfaces are closed as far as they are known; a thing shows where it is the nearest,
+thing's points are apart, so that surfaces are closed as far as they are known; a thing shows where it is the nearest,
 up to the noise of depth. Structure hides things too.
 """
 
@@ -22,7 +22,7 @@ from list3r.queries.views.surfaces import inside_box
 _WIDTH = 160
 """Cells across the depth buffer."""
 _NEAR = 0.02
-"""Nothing nearer than this share of the median depth is drawn: the camera stands inside of it."""
+"""Nothing nearer than this share of the median depth is drawn: the camera is inside of it."""
 _MAX_REACH = 40
 """Cells that one point reaches to each side at most."""
 _BY_CELLS = 6
@@ -45,7 +45,7 @@ class Visibility:
 
     instance: Instance
     inside: float
-    """Share of its surface points that lie in the picture, in [0, 1]."""
+    """Share of its surface points in the picture, in [0, 1]."""
     visible: float
     """Share of its outline within the picture that nothing hides, in [0, 1]."""
     picture: float

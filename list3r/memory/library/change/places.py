@@ -42,7 +42,7 @@ from list3r.memory.library.world.session_ties import SessionTies
 from list3r.memory.store.store import Store
 
 _PICTURES = 256
-"""Small pictures of keyframes that are kept at a time: what is asked about next stands near by."""
+"""Small pictures of keyframes that are kept at a time: the next question is about a place near by."""
 _SPREAD = 0.02
 """Share of points outside the box at either end by which instances are compared."""
 
@@ -151,7 +151,7 @@ class Places:
         return in_sight_of(self._views_of(session, component), self._s.visibility)
 
     def far_apart(self, n: int, m: int) -> bool:
-        """Return whether two instances lie so far apart that no surface of `n` meets `m`, or lies in the box of `m`.
+        """Return whether two instances are so far apart that no surface of `n` meets `m`, or is in the box of `m`.
 
         The box of some points reaches beyond them by less than twice the diagonal of their extent.
         """
@@ -168,7 +168,7 @@ class Places:
         return np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.full((2, 3), np.nan)
 
     def inside(self, n: int, box: OrientedBox, slack_m: float, session: int, *, before: bool) -> float:
-        """Return the share of its surface points that lie in a box."""
+        """Return the share of its surface points in a box."""
         points = self.points(n, session, before=before)
         if len(points) == 0:
             return 0.0
@@ -194,8 +194,8 @@ class Places:
         return doubtful
 
     def _look(self, n: int, views: Sequence[DepthView], session: int, *, before: bool) -> PlaceVisibility:
-        """Return what frames see at a place, by depth and, where that sees a surface, by its colours; nothing is told
-        of what may be there as the session may lie.
+        """Return what frames see at a place, by depth and, where depth sees a surface, by its colours; "unseen" where
+        the uncertainty of the session's pose allows that the instance is there.
         """
         (points, rgb), s = self._thinned(n, session, before=before), self._s
         found, other = place_visibility(points, views, s.visibility), None
@@ -211,7 +211,7 @@ class Places:
         return found
 
     def _other_colors(self, rgb: Colors, session: int, *, before: bool) -> OtherSurface | None:
-        """Return what tells whether frames show other colours than points have; None where the light is not known.
+        """Return a test whether frames show other colours than points have; None where the light is not known.
 
         The points were seen `before` the session and the frames are of it, or the other way round. Shape (N, 3).
         """
@@ -234,15 +234,13 @@ class Places:
         return small_picture(self._store.keyframes.get(chunk_id, frame_index).jpeg, height, width)
 
     def changed(self, n: int, session: int, *, before: bool) -> float:
-        """Return the share of its surface that is seen through, of what is told: of what was, by a session that comes
-        after; of what is, by the sessions before.
+        """Return the share of its observed surface that is seen through: of what was, by a session that comes after;
+        of what is, by the sessions before.
         """
         return self._changed(self.points(n, session, before=before), n, session, before=before)
 
     def explained(self, n: int, new: Sequence[int], session: int) -> float:
-        """Return the share of the surface that an instance had which is seen through or lies at what is new there, of
-        what is told.
-        """
+        """Return the share of the observed surface of an instance that is seen through or near a new instance there."""
         points = self.points(n, session, before=True)
         free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
         known, near = free + met > 0, self._at_new(points, new, session)
@@ -277,7 +275,7 @@ class Places:
         return (self._views_of(s, component) for s in told_by)
 
     def known_before(self, n: int, session: int) -> bool:
-        """Return whether an earlier session lies in the same world, so that an instance can be new to it."""
+        """Return whether an earlier session is in the same world, so that an instance can be new to it."""
         return any(c.component == self.component[n] and c.session_id < session for c in self.rows.values())
 
     def looks(self, n: int, session: int, *, before: bool, stayed: bool = False) -> GroupLooks:
@@ -317,7 +315,7 @@ class Places:
         return LightBetween.of(np.concatenate(before), np.concatenate(after)) or SAME_LIGHT
 
     def other_surface(self, n: int, m: int, session: int) -> bool:
-        """Return whether a new instance `m` lies where the surface of `n` was, in other colours."""
+        """Return whether a new instance `m` is where the surface of `n` was, in other colours."""
         a, b = self._meeting(n, m, session)
         light = self.light(session)
         if len(a) < self._s.displaced * sum(len(self._points_of(k)) for k in self._surface(n, session, before=True)):
@@ -365,7 +363,7 @@ class Places:
         return changed if changed.sum() >= self._s.least_changed * len(points) else np.ones(len(points), bool)
 
     def _with_foot(self, points: Array, changed: NDArray[np.bool_]) -> Array:
-        """Return the points that have changed, and those below that depth does not tell from what they stand on."""
+        """Return the points that have changed, and points below them that depth does not part from their support."""
         if not self._upright or changed.all() or not changed.any():
             return points[changed]
         box = fit_box(points[changed], upright=True, trim=_SPREAD)

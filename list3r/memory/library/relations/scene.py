@@ -68,7 +68,7 @@ class RelationScene:
         self.box_gap[component[:, None] != component[None]] = np.inf
         self.low, self.high = low, high
         self.foot = low[:, 2].copy()
-        """Where each instance ends below; down to the floor for what stands on it."""
+        """Where each instance ends below; down to the floor for what is on it."""
         self.covering = np.zeros(len(instances), dtype=bool)
         """Whether each is a rug."""
         self.size = np.array([b.size for b in instances])
@@ -147,7 +147,7 @@ def _in_company(surface: SampledSurface, at: NDArray[np.int64]) -> NDArray[np.bo
 
 _COMPANY, _NEAR, _TURNED = 4, 32, 250
 _SAMPLE = 200
-"""Points that stand for an instance where its outline matters, not its detail."""
+"""Points that represent an instance where its outline matters, not its detail."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Footprint:
 
 
 def certainty(margin: float, noise: float) -> float:
-    """Return how likely a decision stands when its margin is measured with this noise: 0.5 at the boundary."""
+    """Return how likely a decision holds when its margin is measured with this noise: 0.5 at the boundary."""
     return 1.0 / (1.0 + math.exp(-max(-700.0, min(1.7 * margin / max(noise, 1e-12), 700.0))))
 
 

@@ -1,4 +1,4 @@
-"""How surely sessions lie on each other: what the relations between them leave open."""
+"""How surely sessions are placed on each other: what the relations between them leave open."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from list3r.memory.library.uncertainty import point_covariances
 
 
 def keyframes_of(edge: Edge, session_of: Mapping[int, int]) -> set[tuple[int, int]]:
-    """Return session and Frame.index of the keyframes that a relation stands on."""
+    """Return session and Frame.index of the keyframes that a relation rests on."""
     if edge.frames is None:
         return set()
     return {(session_of[chunk], frame) for chunk, frame in zip((edge.u, edge.v), edge.frames, strict=True)}
@@ -47,7 +47,7 @@ class SessionTies:
         session_of = {k: c.session_id for k, c in rows.items()}
         believed = [e for e in edges if e.accepted and e.u in rows and e.v in rows]
         self._of: dict[int, list[tuple[Sim3, Array]]] = {}
-        """By the later session: where chunk u of each relation lies, and the covariance that it states."""
+        """By the later session: the pose of chunk u of each relation, and the covariance that it states."""
         for e in counted_once(believed, session_of):
             later = max(session_of[e.u], session_of[e.v])
             if session_of[e.u] != session_of[e.v] and e.covariance is not None:

@@ -16,7 +16,7 @@ class World:
     """What a metre is in world units."""
     light: Reference
     floor_seen: bool
-    """Whether the floor was seen and somebody knows which way is up; how high it is, is told place by place."""
+    """Whether the floor was seen and somebody knows which way is up; its height is found place by place."""
     upright: bool
     """Whether z is up, in the first component."""
     first: int

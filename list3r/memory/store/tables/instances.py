@@ -73,7 +73,7 @@ _COLUMNS = Columns(
 
 @dataclass(frozen=True)
 class Ranks:
-    """What orders instances among those that words name equally well, and tells how large they are."""
+    """What orders instances that words name equally well, and their sizes."""
 
     ids: NDArray[np.int64]
     """Ascending. Shape (N,)."""
@@ -172,10 +172,7 @@ class Instances:
         wanted = np.sort(ids)
         fresh = wanted[~_is_in(wanted, self._ranked.ids)]
         if len(fresh):
-            rows = self._rows.columns_of(
-                ("id", "confidence", "state", "structure", "max(size_x, size_y, size_z)"), fresh.tolist()
-            )
-            self._ranked = self._ranked.with_more(_ranks(list(rows)))
+            self._ranked = self._ranked.with_more(_ranks(list(self._rows.columns_of(_RANK, fresh.tolist()))))
         held = wanted[_is_in(wanted, self._ranked.ids)]
         return self._ranked.among(np.searchsorted(self._ranked.ids, held))
 

@@ -15,7 +15,7 @@ from list3r.memory.store.connection import Connection
 _WEIGHTS = (100, 98, 90, 80)
 """How well a word names an instance, in hundredths, see `memory.core.description.words`; each is a column."""
 _MOST_WORDS = 6
-"""Of a phrase that are told apart by their weights; the others must be there."""
+"""Of a phrase that are ranked by their weights; the others must be there."""
 Bearers = tuple[NDArray[np.int64], NDArray[np.int16]]
 """Ids of instances, and how well words name them, in hundredths. Shapes (N,)."""
 
@@ -60,10 +60,10 @@ class Words:
         """Return what to match for words in each choice of their columns, the best first; none but the last is met by
         any instance twice, for a word is in one column of an instance.
         """
-        told, rest = words[:_MOST_WORDS], "".join(f" AND {_quoted(word)}" for word in words[_MOST_WORDS:])
+        ranked, rest = words[:_MOST_WORDS], "".join(f" AND {_quoted(word)}" for word in words[_MOST_WORDS:])
         columns = [
             [(weight, match) for weight in _WEIGHTS if self._ids(match := f"w{weight} : {_quoted(word)}", 1)]
-            for word in told
+            for word in ranked
         ]
         chosen = [(sum(w for w, _ in c), " AND ".join(f"({m})" for _, m in c) + rest) for c in product(*columns)]
         return sorted(chosen, key=lambda c: -c[0])
