@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from list3r.frames.sift import CONTRAST
 from list3r.reconstruction.base import KeyframeSpacing
 from list3r.reconstruction.mvs.settings import MvsSettings
 
@@ -68,10 +69,8 @@ class FinderSettings:
     """SIFT features of a keyframe."""
     learned_count: int = 1200
     """Learned ones."""
-    contrast: float = 0.015
+    contrast: float = CONTRAST
     """SIFT's contrast threshold."""
-    ratio: float = 0.85
-    """Lowe's ratio of SIFT."""
     few: int = 300
     """The best features, by which keyframes worth matching are chosen."""
     least_few: int = 4
