@@ -97,7 +97,6 @@ class VideoMapSettings:
     """Fewest corners or features of a pair."""
     mapping: MappingSettings = field(
         default_factory=lambda: MappingSettings(
-            steady=4.0,
             growth=1.7,
             whole_iterations=10,
             whole_rounds=1,
@@ -106,8 +105,7 @@ class VideoMapSettings:
             turned_scale=0.04,
         )
     )
-    """Rougher than a chunk's, since all is adjusted afterwards; grown again only where depth jumps: by 17 in a deformed
-    map of a walk with wide turns, by 1.7 at most on redkitchen (research/colour-video 0128)."""
+    """Rougher than a chunk's, since all is adjusted afterwards."""
     joining: JoiningSettings = field(default_factory=JoiningSettings)
     """Of maps of its parts."""
     revisits: RevisitPairSettings = field(default_factory=RevisitPairSettings)
