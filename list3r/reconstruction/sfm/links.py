@@ -13,7 +13,7 @@ import numpy as np
 
 from list3r.reconstruction.sfm.keyframe_features import Finder, LocalFeatures, likely_pairs, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, shared_rows
-from list3r.reconstruction.sfm.settings import LinkSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, LinkSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 _FEATURE_IDS = 1_000_000
@@ -31,20 +31,20 @@ def keyframe_problem(
     `finder` finds features where tracks do not reach; None takes SIFT.
     """
     chosen = settings or LinkSettings()
-    problem = corner_problem(tracks, chosen)
+    problem = corner_problem(tracks)
     if len(np.unique(tracks.run[list(tracks.keyframes)])) < 2:
         return problem
     return with_features(problem, finder or make_finder(grays, None, None, chosen.features), chosen)
 
 
-def corner_problem(tracks: CornerTracks, settings: LinkSettings) -> MapProblem:
+def corner_problem(tracks: CornerTracks) -> MapProblem:
     """Return the keyframes of a chunk with their tracked corners alone."""
     views = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     pairs = {}
     for n, a in enumerate(tracks.keyframes):
         for b in tracks.keyframes[n + 1 :]:
             rows = shared_rows(views[a], views[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
-            if len(rows) >= settings.least_matches:
+            if len(rows) >= LEAST_MATCHES:
                 pairs[a, b] = rows
     return MapProblem(views, pairs)
 
@@ -70,7 +70,7 @@ def with_neighbours(
         for other in order[n + 1 : n + 1 + settings.ahead]:
             a, b = min(one, other), max(one, other)
             rows = match_features(found[a], found[b])
-            if len(rows) < settings.least_matches:
+            if len(rows) < LEAST_MATCHES:
                 continue
             rows = rows + np.array([first[a], first[b]])
             if (a, b) not in pairs:
@@ -85,7 +85,7 @@ def with_features(problem: MapProblem, finder: Finder, settings: LinkSettings) -
     views, first = _joined(problem.views, found, 0)
     for a, b in likely_pairs(found, set(pairs), settings.features):
         rows = match_features(found[a], found[b])
-        if len(rows) >= settings.least_matches:
+        if len(rows) >= LEAST_MATCHES:
             pairs[a, b] = rows + np.array([first[a], first[b]])
     return MapProblem(views, pairs, frozenset(set(pairs) - set(problem.pairs)))
 

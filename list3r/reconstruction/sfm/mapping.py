@@ -19,7 +19,7 @@ from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.consistency import contradicted
 from list3r.reconstruction.sfm.pure_rotation import only_turns
-from list3r.reconstruction.sfm.settings import MappingSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, SEED, MappingSettings
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -285,7 +285,7 @@ def correspondences(
     if database is None:
         return None
     options = pycolmap.DatabaseCacheOptions()
-    options.min_num_matches = settings.least_matches
+    options.min_num_matches = LEAST_MATCHES
     return pycolmap.DatabaseCache.create(database, options)
 
 
@@ -318,7 +318,7 @@ def database_of(
             found.inlier_matches = verified.get((a, b), rows[:0]).astype(np.uint32)
         else:
             found = _two_view(problem, (a, b), lens, camera, free_camera, settings)
-        wanted = max(settings.least_matches, settings.matched_share * len(rows) if matched else 0.0)
+        wanted = max(LEAST_MATCHES, settings.matched_share * len(rows) if matched else 0.0)
         if found is not None and len(found.inlier_matches) >= wanted:
             database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
             database.write_two_view_geometry(a + 1, b + 1, found)
@@ -330,12 +330,12 @@ def _two_view(
     problem: MapProblem, pair: tuple[int, int], lens: Any, camera: Camera, free_camera: str, settings: MappingSettings
 ) -> Any:
     rows = problem.pairs[pair]
-    if len(rows) < settings.least_matches:
+    if len(rows) < LEAST_MATCHES:
         return None
     options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers, options.detect_watermark = settings.least_matches, False
+    options.min_num_inliers, options.detect_watermark = LEAST_MATCHES, False
     options.ransac.max_error = settings.pair_error_px * pixel_unit(camera) * (2.0 if free_camera else 1.0)
-    options.ransac.random_seed, options.ransac.num_threads = settings.seed, 1
+    options.ransac.random_seed, options.ransac.num_threads = SEED, 1
     if pair in problem.matched:
         options.min_E_F_inlier_ratio, options.ransac.min_inlier_ratio = 0.0, settings.matched_share
     calibrated, free = pycolmap.estimate_calibrated_two_view_geometry, pycolmap.estimate_two_view_geometry
@@ -347,8 +347,8 @@ def _two_view(
 def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
     """Return pycolmap's options for growing and filtering a map."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.extract_colors = 1, settings.seed, False
-    options.min_num_matches, options.min_model_size = settings.least_matches, 2
+    options.num_threads, options.random_seed, options.extract_colors = 1, SEED, False
+    options.min_num_matches, options.min_model_size = LEAST_MATCHES, 2
     options.init_num_trials, options.max_num_models = 50, 10
     options.ba_refine_focal_length = free_camera == "focal"
     options.ba_refine_extra_params = bool(free_camera)
@@ -360,10 +360,10 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.tolerance
     options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
     mapper, unit = options.mapper, pixel_unit(camera)
-    mapper.num_threads, mapper.random_seed = 1, settings.seed
-    mapper.init_min_num_inliers = 2 * settings.least_matches
+    mapper.num_threads, mapper.random_seed = 1, SEED
+    mapper.init_min_num_inliers = 2 * LEAST_MATCHES
     mapper.init_max_error = settings.pair_error_px * unit * (2.0 if free_camera else 1.0)
-    mapper.abs_pose_min_num_inliers = settings.least_matches
+    mapper.abs_pose_min_num_inliers = LEAST_MATCHES
     mapper.abs_pose_max_error = settings.pose_error_px * unit
     mapper.abs_pose_refine_focal_length = free_camera == "focal"
     mapper.abs_pose_refine_extra_params = bool(free_camera)
@@ -372,7 +372,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     mapper.ba_local_min_tri_angle, mapper.ba_local_num_images = 2.0, settings.part_views
     options.triangulation.min_angle = settings.point_angle_deg
     options.triangulation.ignore_two_view_tracks = False
-    options.triangulation.random_seed = settings.seed
+    options.triangulation.random_seed = SEED
     return options
 
 
