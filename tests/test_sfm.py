@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from list3r.frames.base import BadFrame, Camera, Frame, SourceInfo
+from list3r.frames.base import BadFrame, Camera, Frame, FrameSource, SourceInfo
 from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.core.errors import TrackingError
 from list3r.memory.core.geometry import rotation_exp, umeyama
@@ -51,18 +51,18 @@ def centres(frames: Sequence[Frame]) -> np.ndarray:
     return np.stack([np.asarray(f.T_source_cam)[:3, 3] for f in frames])
 
 
-class Held:
+class Held(FrameSource):
     """A source whose frames are in memory."""
 
     def __init__(self, frames: Sequence[Frame], camera: Camera | None) -> None:
         size = frames[0].color.shape[:2]
         self._frames = frames
-        self.info = SourceInfo(
+        self._info = SourceInfo(
             "images", "here", len(frames), 30.0, camera, False, False, "", image_size=(size[0], size[1])
         )
 
-    def read(self, start: int, stop: int) -> Iterator[Frame | BadFrame]:
-        return iter(self._frames[start:stop])
+    def read_every(self, start: int, stop: int, step: int) -> Iterator[Frame | BadFrame]:
+        return iter(self._frames[start:stop:step])
 
     def position(self, index: int) -> int:
         return index
