@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmarks.simulation.presets import make_shot
 from list3r.frames.base import Camera
+from list3r.frames.sift import root_sift
 from list3r.reconstruction.features.local import detect
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.features.vlad import root_sift
 from list3r.simulation.rendering.render import Renderer
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from list3r.frames.sift import nearest_pairs
 from list3r.frames.source import open_source
 from list3r.memory.core.errors import OptionError
 from list3r.reconstruction.features.detectors import make_detector
 from list3r.reconstruction.features.learned import LEARNED_WIDTH, as_bytes
-from list3r.reconstruction.features.local import match, nearest_pairs
+from list3r.reconstruction.features.local import match
 from list3r.reconstruction.keyframe_record import KeyframeNetworks, make_keyframes
 from list3r.reconstruction.rgbd.reconstructor import RgbdReconstructor
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.evaluation.covisibility import Covisibility
+from list3r.frames.recordings.stamps import nearest_rows
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.records import Edge, JsonFields
 
@@ -323,9 +324,7 @@ def _nearest_rows(frame: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArra
     """Return row of nearest known frame, -1 where it is further away than the greatest step between known frames."""
     if not len(frame):
         return np.full(len(wanted), -1, dtype=np.int64)
-    right = np.clip(np.searchsorted(frame, wanted), 0, len(frame) - 1)
-    left = np.maximum(right - 1, 0)
-    row = np.where(np.abs(frame[left] - wanted) <= np.abs(frame[right] - wanted), left, right)
+    row = nearest_rows(frame, wanted)
     reach = int(np.diff(frame).max()) if len(frame) > 1 else 0
     return np.where(np.abs(frame[row] - wanted) <= reach, row, -1).astype(np.int64)
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.recordings.pose_lists import read_pose_list
+from list3r.frames.recordings.stamps import nearest_rows
 from list3r.memory.core.errors import DegenerateError, OptionError, SourceError
 from list3r.memory.core.geometry import Sim3, quat_wxyz_from_rotation, rotation_log, umeyama
 from list3r.memory.core.records import JsonFields
@@ -189,10 +190,7 @@ def associate(truth_time_s: Array, time_s: Array, tolerance_s: float = 0.01) -> 
     """
     swap = len(truth_time_s) >= len(time_s)
     short, long = (time_s, truth_time_s) if swap else (truth_time_s, time_s)
-    right = np.clip(np.searchsorted(long, short), 1, max(len(long) - 1, 1))
-    right = np.minimum(right, len(long) - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(np.abs(long[left] - short) <= np.abs(long[right] - short), left, right)
+    nearest = nearest_rows(long, short)
     rows = np.flatnonzero(np.abs(long[nearest] - short) <= tolerance_s)
     pair = rows.astype(np.int64), nearest[rows].astype(np.int64)
     return (pair[1], pair[0]) if swap else pair
@@ -293,12 +291,9 @@ def delta_pairs(truth: Trajectory, delta: Delta) -> tuple[NDArray[np.int64], NDA
     else:
         steps = np.linalg.norm(np.diff(truth.positions(), axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(steps)]) if delta.unit == "m" else truth.time_s
-        wanted = along + delta.value
-        start = np.arange(count - 1)
-        right = np.clip(np.searchsorted(along, wanted[:-1]), start + 1, count - 1)
-        left = np.maximum(right - 1, start + 1)
-        end = np.where(np.abs(along[left] - wanted[:-1]) <= np.abs(along[right] - wanted[:-1]), left, right)
-        near = np.abs(along[end] - wanted[:-1]) <= _DELTA_TOLERANCE * delta.value
+        start, wanted = np.arange(count - 1), along[:-1] + delta.value
+        end = np.maximum(nearest_rows(along, wanted), start + 1)
+        near = np.abs(along[end] - wanted) <= _DELTA_TOLERANCE * delta.value
         start, end = start[near], end[near]
     if len(start) == 0:
         raise OptionError(f"no two of {count} associated poses are {delta} apart: give a smaller delta")

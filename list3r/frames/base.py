@@ -79,6 +79,15 @@ class Frame:
     T_source_cam: NDArray[np.float64] | None
     """Given pose of the colour camera in the source's own world, if the source has one. Shape (4, 4)."""
 
+    def gray(self, width: int | None = None) -> NDArray[np.uint8]:
+        """Return the picture in grey, shrunk to a longer side of at most `width` px. Shape (H, W)."""
+        import cv2
+
+        gray = np.asarray(cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY), np.uint8)
+        scale = 1.0 if width is None else min(1.0, width / max(gray.shape))
+        size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
+        return gray if scale == 1.0 else np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+
 
 @dataclass(frozen=True)
 class SourceInfo:
@@ -229,11 +238,8 @@ class FrameSource(ABC):
 
     def read_grays(self, start: int, stop: int) -> Iterator[NDArray[np.uint8] | None]:
         """Grey pictures at positions [start, stop), large enough for local features; None for one that is damaged."""
-        import cv2
-
         for frame in self.read(start, stop):
-            gray = None if isinstance(frame, BadFrame) else cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-            yield None if gray is None else np.asarray(gray, np.uint8)
+            yield None if isinstance(frame, BadFrame) else frame.gray()
 
     def thumbnails(self) -> Iterator[NDArray[np.uint8] | None]:
         """Small grey pictures of all frames in order, in one pass; None for one that is damaged."""

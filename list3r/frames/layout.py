@@ -90,14 +90,6 @@ def varies_note(spread: float, carried: bool) -> str:
     return f"focal lengths of frames differ by {100 * spread:.1f} %: {what}"
 
 
-def own_camera(stated: Sequence[float], where: Path) -> Camera:
-    """Return the camera of one frame from fx, fy, cx, cy, width, height. Raises `SourceError`."""
-    try:
-        return Camera(round(stated[4]), round(stated[5]), *check_intrinsics(stated[:4]))
-    except (ValueError, OptionError) as error:
-        raise SourceError(f"{where}: {error}") from None
-
-
 def usual_camera(cameras: Sequence[Camera]) -> Camera:
     """Return the camera that stands for all: the only one, or the median pinhole of those of the most usual size."""
     if len(cameras) == 1:
@@ -105,11 +97,6 @@ def usual_camera(cameras: Sequence[Camera]) -> Camera:
     width, height = Counter((c.width, c.height) for c in cameras).most_common(1)[0][0]
     same = [(c.fx, c.fy, c.cx, c.cy) for c in cameras if (c.width, c.height) == (width, height)]
     return Camera(width, height, *np.median(np.array(same), axis=0).tolist())
-
-
-def there(path: Path) -> Path | None:
-    """Return the path of a file that is there, else None."""
-    return path if path.is_file() else None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -218,7 +218,7 @@ def _matches(a: Frame, b: Frame, s: AgreementSettings) -> tuple[NDArray[np.float
     import cv2
 
     corners = cv2.ORB.create(s.features)
-    found = [corners.detectAndCompute(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), None) for f in (a, b)]
+    found = [corners.detectAndCompute(f.gray(), None) for f in (a, b)]
     (points_a, words_a), (points_b, words_b) = found
     if words_a is None or words_b is None:
         return np.zeros((0, 2)), np.zeros((0, 2))

@@ -23,11 +23,11 @@ from list3r.pipeline.request import Progress, RunOptions, Watch
 from list3r.semantics.detection import DetectReport, detect, open_sources
 
 if TYPE_CHECKING:
-    from list3r.pipeline.reports import BuildReport, UpdateReport
+    from list3r.pipeline.reports import RunReport
     from list3r.semantics.detector import Detector
     from list3r.semantics.nanodet import NanoDet
 
-R = TypeVar("R", bound="BuildReport | UpdateReport")
+R = TypeVar("R", bound="RunReport")
 
 
 class FinishingError(List3rError):
@@ -36,7 +36,7 @@ class FinishingError(List3rError):
     def __init__(self, error: List3rError, report: object) -> None:
         super().__init__(str(error))
         self.report = report
-        """The `BuildReport` or `UpdateReport`: the memory is there all the same."""
+        """The `RunReport`: the memory is there all the same."""
 
 
 def check_run(run: RunOptions, note: Callable[[str], None] = lambda _: None) -> None:

@@ -36,8 +36,8 @@ class LiveReport:
 
 
 @dataclass(frozen=True)
-class BuildReport(JsonFields):
-    """What a build did."""
+class RunReport(JsonFields):
+    """What a build and an update say alike."""
 
     frames: int
     posed: int
@@ -45,20 +45,26 @@ class BuildReport(JsonFields):
     bad: int
     chunks: int
     components: int
-    loops: int
     instances: int
-    structure: int
-    relations: int
     seconds: float
     """Wall time of this run."""
     frames_per_second: float
     """Frames of this run (a resumed build counts only what it did itself) by wall time."""
     resumed_chunks: int
     """Chunks that an earlier run had finished."""
-    stage_seconds: dict[str, float]
-    """CPU seconds by stage, over all runs."""
     notes: tuple[str, ...]
     """What the user should know, one sentence each."""
+
+
+@dataclass(frozen=True)
+class BuildReport(RunReport):
+    """What a build did."""
+
+    loops: int
+    structure: int
+    relations: int
+    stage_seconds: dict[str, float]
+    """CPU seconds by stage, over all runs."""
     film: str | None = None
     """What kept the video from more and what to do; None where nothing did."""
     live: LiveReport | None = None
@@ -66,89 +72,72 @@ class BuildReport(JsonFields):
 
 
 @dataclass(frozen=True)
-class UpdateReport(JsonFields):
+class UpdateReport(RunReport):
     """What an update did."""
 
     session: int
     """Number of the new session."""
-    frames: int
-    posed: int
-    lost: int
-    bad: int
-    chunks: int
     placed: int
     """Chunks of the session that lie in the world of an earlier one."""
     ties: int
     """Accepted relations between chunks of this session and of earlier ones."""
-    components: int
-    instances: int
     events: dict[str, int]
     """How many things were seen_again, moved, removed and added."""
-    seconds: float
-    frames_per_second: float
-    resumed_chunks: int
-    notes: tuple[str, ...]
+
+
+def _run_report(store: Store, plan: Plan, started: float) -> RunReport:
+    """Return what a run did, without notes."""
+    states = [f.state for f in store.frames.all(plan.session)]
+    seconds = time.monotonic() - started
+    return RunReport(
+        frames=len(states),
+        posed=states.count("posed"),
+        lost=states.count("lost"),
+        bad=states.count("bad"),
+        chunks=len(plan.spans),
+        components=len({c.component for c in store.chunks.all()}),
+        instances=len(store.instances.all(structure=False)),
+        seconds=round(seconds, 2),
+        frames_per_second=round(plan.fresh_frames() / seconds, 2),
+        resumed_chunks=len(plan.done),
+        notes=(),
+    )
 
 
 def build_report(store: Store, plan: Plan, started: float) -> BuildReport:
     """Return what a build did that began at a time of `time.monotonic`."""
-    frames = store.frames.all(plan.session)
-    seconds = time.monotonic() - started
-    components = len({c.component for c in store.chunks.all()})
-    lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
+    run = _run_report(store, plan, started)
+    said = vars(run) | {"notes": _build_notes(store, plan.session, run.lost, run.components)}
     return BuildReport(
-        frames=len(frames),
-        posed=sum(f.state == "posed" for f in frames),
-        lost=lost,
-        bad=bad,
-        chunks=len(plan.spans),
-        components=components,
+        **said,
         loops=sum(e.kind == "loop" and e.accepted for e in store.edges.all()),
-        instances=len(store.instances.all(structure=False)),
         structure=len(store.instances.all(structure=True)),
         relations=len(store.relations.all()),
-        seconds=round(seconds, 2),
-        frames_per_second=round(plan.fresh_frames() / seconds, 2),
-        resumed_chunks=len(plan.done),
         stage_seconds={k: round(v, 2) for k, v in store.chunks.stage_seconds().items()},
-        notes=_build_notes(store, plan.session, lost, components),
         film=film_advice(store, plan.session),
     )
 
 
 def update_report(store: Store, plan: Plan, started: float) -> UpdateReport:
     """Return what an update did that began at a time of `time.monotonic`."""
-    session = plan.session
-    frames = store.frames.all(session)
+    session, run = plan.session, _run_report(store, plan, started)
     rows = store.chunks.all()
     own = [c for c in rows if c.session_id == session]
     known = {c.component for c in rows if c.session_id < session}
     placed = sum(c.component in known for c in own)
-    lost, bad = (sum(f.state == state for f in frames) for state in ("lost", "bad"))
     events = [e.kind for e in store.events.all(session)]
-    seconds = time.monotonic() - started
-    tied = ties(store, session)
+    notes = (
+        *settled_notes(store, session),
+        *_bad_notes(store.frames.all(session)),
+        *_update_notes(len(own), placed, held(store, session), run.lost, run.frames),
+        *lost_reasons(store, session),
+    )
     return UpdateReport(
+        **vars(run) | {"chunks": len(own), "notes": notes},
         session=session,
-        frames=len(frames),
-        posed=sum(f.state == "posed" for f in frames),
-        lost=lost,
-        bad=bad,
-        chunks=len(own),
         placed=placed,
-        ties=len(tied),
-        components=len({c.component for c in rows}),
-        instances=len(store.instances.all(structure=False)),
+        ties=len(ties(store, session)),
         events={kind: events.count(kind) for kind in ("seen_again", "moved", "removed", "added")},
-        seconds=round(seconds, 2),
-        frames_per_second=round(plan.fresh_frames() / seconds, 2),
-        resumed_chunks=len(plan.done),
-        notes=(
-            *settled_notes(store, session),
-            *_bad_notes(frames),
-            *_update_notes(len(own), placed, held(store, session), lost, len(frames)),
-            *lost_reasons(store, session),
-        ),
     )
 
 

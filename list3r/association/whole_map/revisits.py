@@ -14,6 +14,7 @@ from list3r.frames.base import Camera
 from list3r.memory.core.geometry import Sim3
 from list3r.reconstruction.sfm.frame_poses import pose_of
 from list3r.reconstruction.sfm.keyframe_features import match_features
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]
@@ -58,7 +59,7 @@ def find_revisits(
     out, common = [], {}
     for a, b in candidate_pairs(views, camera, settings):
         rows = match_features(views[a].features, views[b].features)
-        if len(rows) < settings.least_matches:
+        if len(rows) < LEAST_MATCHES:
             continue
         at_a, at_b = rows.T
         sides = views[a].points_cam[at_a], views[b].features.xy[at_b], views[b].points_cam[at_b]

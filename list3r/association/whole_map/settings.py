@@ -24,8 +24,6 @@ class RevisitPairSettings:
     """and the frames with the most similar descriptors."""
     away: float = 0.05
     """A revisit counts as a loop where the camera in between saw no more than this share of the place."""
-    least_matches: int = 20
-    """Fewest features that two have in common."""
     least_scale_points: int = 8
     """Fewest common points that determine the scale."""
     shift: tuple[float, float] = (0.15, 0.04)
@@ -93,11 +91,8 @@ class VideoMapSettings:
     """In front of a bare wall there are only faint features: four times the right matches of the usual contrast."""
     pair_steps: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
     """Keyframes ahead with which each is matched: near ones continue the map, far ones its scale."""
-    least_matches: int = 20
-    """Fewest corners or features of a pair."""
     mapping: MappingSettings = field(
         default_factory=lambda: MappingSettings(
-            steady=4.0,
             growth=1.7,
             whole_iterations=10,
             whole_rounds=1,
@@ -106,8 +101,7 @@ class VideoMapSettings:
             turned_scale=0.04,
         )
     )
-    """Rougher than a chunk's, since all is adjusted afterwards; grown again only where depth jumps: by 17 in a deformed
-    map of a walk with wide turns, by 1.7 at most on redkitchen (research/colour-video 0128)."""
+    """Rougher than a chunk's, since all is adjusted afterwards."""
     joining: JoiningSettings = field(default_factory=JoiningSettings)
     """Of maps of its parts."""
     revisits: RevisitPairSettings = field(default_factory=RevisitPairSettings)

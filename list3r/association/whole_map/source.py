@@ -10,7 +10,6 @@ from list3r.association.whole_map.settings import VideoMapSettings
 from list3r.association.whole_map.video_map import VideoMap, map_video
 from list3r.frames.base import Frame, FrameSource
 from list3r.frames.chunking.pace import PaceSettings, picture_flows
-from list3r.frames.decoding.picture import gray_of
 from list3r.reconstruction.sfm.settings import SfmSettings
 
 
@@ -29,7 +28,7 @@ def map_source(source: FrameSource, sfm: SfmSettings, settings: VideoMapSettings
     """
     camera = source.info.camera
     assert camera is not None, "the camera is estimated before"
-    frames = [(f.index, gray_of(f)) for f in source.read(0, source.info.frame_count) if isinstance(f, Frame)]
+    frames = [(f.index, f.gray()) for f in source.read(0, source.info.frame_count) if isinstance(f, Frame)]
     found = map_video([gray for _, gray in frames], camera, sfm, settings)
     if found is None:
         return None

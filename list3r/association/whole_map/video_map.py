@@ -23,7 +23,7 @@ from list3r.reconstruction.sfm.frame_poses import PosedSegment, pose_segments
 from list3r.reconstruction.sfm.global_map import with_global_map
 from list3r.reconstruction.sfm.keyframe_features import LocalFeatures, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, build_maps, shared_rows
-from list3r.reconstruction.sfm.settings import MIDDLE_DEPTH, SfmSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, MIDDLE_DEPTH, SfmSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray, follow_corners
 from list3r.reconstruction.sfm.two_view import verified_rows
 
@@ -95,11 +95,11 @@ def video_problem(tracks: CornerTracks, features: dict[int, LocalFeatures], sett
         for b in (tracks.keyframes[n + step] for step in settings.pair_steps if n + step < len(tracks.keyframes)):
             rows = shared_rows(corners[a], corners[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
             alike = match_features(features[a], features[b])
-            if len(rows) < settings.least_matches and len(alike) >= settings.least_matches:
+            if len(rows) < LEAST_MATCHES and len(alike) >= LEAST_MATCHES:
                 matched.add((a, b))
-            alike = alike if len(alike) >= settings.least_matches else _NO_ROWS
+            alike = alike if len(alike) >= LEAST_MATCHES else _NO_ROWS
             rows = np.concatenate([rows, alike + np.array([first[a], first[b]])])
-            if len(rows) >= settings.least_matches:
+            if len(rows) >= LEAST_MATCHES:
                 pairs[a, b] = rows
     return MapProblem(views, pairs, frozenset(matched))
 

@@ -128,19 +128,13 @@ class _Sieve:
     _corners: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 1, 2), np.float32))
 
     def is_new(self, frame: Frame) -> bool:
-        gray = self._small(frame)
+        gray = frame.gray(self.settings.width)
         if self._gray is not None and not self._moved(self._gray, gray):
             return False
         found = cv2.goodFeaturesToTrack(gray, self.settings.corners, 0.01, 6)
         self._corners = np.zeros((0, 1, 2), np.float32) if found is None else np.asarray(found, np.float32)
         self._gray, self.last = gray, frame.index
         return True
-
-    def _small(self, frame: Frame) -> Gray:
-        gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-        shrink = min(1.0, self.settings.width / max(gray.shape))
-        size = (max(1, round(gray.shape[1] * shrink)), max(1, round(gray.shape[0] * shrink)))
-        return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _moved(self, before: Gray, gray: Gray) -> bool:
         s = self.settings

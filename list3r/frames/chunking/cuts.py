@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import FrameSource
+from list3r.frames.sift import nearest_pairs, root_sift, sift
 
 Floats = NDArray[np.float32]
 Gray = NDArray[np.uint8]
@@ -38,8 +39,6 @@ class ShotCutSettings:
     hand-held video at 3 to 30 a second 99 in 100 are above, of frames of different places 1 in 100."""
     features: int = 500
     """Local features on a frame where a suspect is looked at."""
-    ratio: float = 0.85
-    """Lowe's ratio of best to second best distance."""
     least_features: int = 60
     """A frame with fewer (a plain wall, darkness, blur) says nothing."""
     least_agreeing: int = 14
@@ -58,7 +57,7 @@ def find_cuts(
 ) -> tuple[int, ...]:
     """Positions of `source` before which the video jumps, ascending.
 
-    Reads every frame once, small where the source can (a `ThumbnailSource`: 0.6 ms a JPEG of 640 x 480), and the few
+    Reads every frame once, small where the source can (0.6 ms a JPEG of 640 x 480), and the few
     around a suspect again; what it keeps does not grow with the video but by some bytes a frame. The same source gives
     the same cuts. A bad frame is passed over: the next is compared with the last good one.
     """
@@ -172,7 +171,6 @@ class _Looks:
 
     def __init__(self, source: FrameSource, settings: ShotCutSettings) -> None:
         self._source, self._settings = source, settings
-        self._sift = cv2.SIFT.create(nfeatures=settings.features, contrastThreshold=0.015)
         self._count = source.info.frame_count
         self._known: dict[int, tuple[Floats, Floats]] = {}
         self._grays: dict[int, Gray | None] = {}
@@ -193,17 +191,10 @@ class _Looks:
 
     def _match(self, a: int, b: int) -> int:
         (xy_a, d_a), (xy_b, d_b) = self._features(a), self._features(b)
-        if min(len(xy_a), len(xy_b)) < 8:
-            return 0
-        likeness = d_a @ d_b.T
-        forth = likeness.argmax(axis=1)
-        rows = np.flatnonzero(likeness.argmax(axis=0)[forth] == np.arange(len(d_a)))
-        top = np.partition(likeness[rows], -2, axis=1)[:, -2:]
-        distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
-        rows = rows[distance[:, 1] < self._settings.ratio * distance[:, 0]]
+        rows = nearest_pairs(d_a, d_b)
         if len(rows) < 8:
             return 0
-        p, q = xy_a[rows], xy_b[forth[rows]]
+        p, q = xy_a[rows[:, 0]], xy_b[rows[:, 1]]
         found = (
             cv2.findFundamentalMat(p, q, cv2.FM_RANSAC, 1.5, 0.999, 2000)[1],
             cv2.findHomography(p, q, cv2.RANSAC, 3.0, maxIters=2000)[1],
@@ -216,12 +207,8 @@ class _Looks:
             while len(self._known) >= _KEPT:
                 del self._known[next(iter(self._known))]
             gray = self._gray(position)
-            points, found = ((), None) if gray is None else self._sift.detectAndCompute(gray, None)
-            if found is None:
-                self._known[position] = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
-            else:
-                root = np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-6))
-                self._known[position] = np.array([k.pt for k in points], np.float32), root.astype(np.float32)
+            xy, found = sift(np.zeros((1, 1), np.uint8) if gray is None else gray, self._settings.features)
+            self._known[position] = xy, root_sift(found)
         return self._known[position]
 
     def _gray(self, position: int) -> Gray | None:

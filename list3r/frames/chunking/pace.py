@@ -67,17 +67,12 @@ def picture_flows(source: FrameSource, settings: PaceSettings, progress: Progres
     for done, start in enumerate(starts, start=1):
         pair = [f for f in source.read(start, start + 2) if isinstance(f, Frame)]
         if len(pair) == 2:
-            flow = _flow(_small(pair[0], settings.width_px), _small(pair[1], settings.width_px))
-            flows += [] if flow is None else [flow / settings.width_px]
+            a, b = (f.gray(settings.width_px) for f in pair)
+            flow = _flow(a, b)
+            flows += [] if flow is None else [flow / max(a.shape)]
         if progress is not None:
             progress(done, len(starts))
     return np.array(flows)
-
-
-def _small(frame: Frame, width_px: int) -> Gray:
-    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    scale = width_px / max(gray.shape)
-    return np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _flow(a: Gray, b: Gray, corners: int = 200, least: int = 12) -> float | None:

@@ -12,13 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.base import Frame
 from list3r.memory.core.errors import FrameError
-
-
-def gray_of(frame: Frame) -> NDArray[np.uint8]:
-    """Return the picture of a frame in grey. Shape (H, W)."""
-    return np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 @dataclass(frozen=True)

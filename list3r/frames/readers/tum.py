@@ -27,7 +27,7 @@ from list3r.frames.layout import (
 )
 from list3r.frames.listing import FrameFile, FrameFiles
 from list3r.frames.options import Intrinsics, SourceOptions, check_distortion
-from list3r.frames.recordings.stamps import as_seconds
+from list3r.frames.recordings.stamps import as_seconds, nearest_rows
 from list3r.memory.core.errors import SourceError
 
 MAX_PAIR_GAP_S = 0.02
@@ -86,7 +86,7 @@ def associate(a_s: NDArray[np.float64], b_s: NDArray[np.float64], max_gap_s: flo
     """
     if not len(a_s) or not len(b_s):
         return np.zeros((0, 2), dtype=np.int64)
-    to_b, to_a = _nearest(a_s, b_s), _nearest(b_s, a_s)
+    to_b, to_a = nearest_rows(b_s, a_s), nearest_rows(a_s, b_s)
     mutual = (to_a[to_b] == np.arange(len(a_s))) & (np.abs(b_s[to_b] - a_s) <= max_gap_s)
     return np.stack([np.flatnonzero(mutual), to_b[mutual]], axis=1)
 
@@ -105,7 +105,7 @@ def poses_at(
     before = np.maximum(after - 1, 0)
     gap = stamps_s[after] - stamps_s[before]
     inside = (times_s >= stamps_s[before]) & (times_s <= stamps_s[after]) & (gap <= MAX_POSE_BRACKET_S)
-    near = _nearest(times_s, stamps_s)
+    near = nearest_rows(stamps_s, times_s)
     known = inside | (np.abs(stamps_s[near] - times_s) <= MAX_PAIR_GAP_S)
     w = np.where(inside & (gap > 0), (times_s - stamps_s[before]) / np.where(gap > 0, gap, 1.0), 0.0)
     first, second = np.where(inside, before, near), np.where(inside, after, near)
@@ -115,13 +115,6 @@ def poses_at(
     matrices[:, :3, :3] = (rotations * Rotation.from_rotvec(w[:, None] * turn)).as_matrix()
     matrices[:, :3, 3] = (1 - w[:, None]) * poses_xyzw[first, :3] + w[:, None] * poses_xyzw[second, :3]
     return [matrix if ok else None for matrix, ok in zip(matrices, known, strict=True)]
-
-
-def _nearest(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.int64]:
-    right = np.clip(np.searchsorted(b, a), 1, max(1, len(b) - 1))
-    right = np.minimum(right, len(b) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(np.abs(a - b[left]) <= np.abs(b[right] - a), left, right)
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,3 +36,10 @@ def times_of_names(paths: Sequence[Path]) -> NDArray[np.float64] | None:
         return as_seconds(np.array(stems, np.float64))
     found = [_REDWOOD_NAME.fullmatch(s) for s in stems]
     return 1e-6 * np.array([float(m[1]) for m in found if m]) if found and all(found) else None
+
+
+def nearest_rows(ascending: NDArray[Any], wanted: NDArray[Any]) -> NDArray[np.int64]:
+    """Return for each wanted value the row of the nearest one, the earlier of two as near. Shape (N,)."""
+    right = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(wanted - ascending[left]) <= np.abs(ascending[right] - wanted), left, right)

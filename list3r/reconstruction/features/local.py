@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera
+from list3r.frames.sift import SIFT_WIDTH, nearest_pairs, root_sift, sift
 from list3r.reconstruction.base import SensorNoise
 from list3r.reconstruction.features.settings import FeatureSettings
-from list3r.reconstruction.features.vlad import root_sift
 from list3r.reconstruction.rgbd.view import Floats
 
-SIFT_WIDTH = 128
 LEARNED_RATIO = 0.95
 """Ratio of best to second best distance for learned descriptors: on redkitchen ALIKED then has SIFT's precision at 0.85
 for frames one second apart and 1.5 times its right pairs."""
@@ -46,29 +45,8 @@ class FeaturePose:
 def detect(color: NDArray[np.uint8], depth: Floats, camera: Camera, settings: FeatureSettings) -> Features:
     """SIFT features of an RGB image, with the depth found at each."""
     gray = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.uint8)
-    factor = shrinkage(gray.shape, settings.width) if settings.width else 1.0
-    sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
-    keypoints, descriptors = sift.detectAndCompute(shrunk(gray, factor), None)
-    if descriptors is None:
-        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
-    xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
-    response = np.array([k.response for k in keypoints])
-    order = np.lexsort((xy[:, 0], xy[:, 1], -response))[: settings.count]
-    xy = xy[order] if factor == 1.0 else ((xy[order] + 0.5) / factor - 0.5).astype(np.float32)
-    return Features(xy, descriptors[order].astype(np.uint8), points_at(xy, depth, camera))
-
-
-def shrinkage(shape: tuple[int, ...], width: int) -> float:
-    """Return the factor by which a picture (h, w) is shrunk to a longer side of at most `width` px."""
-    return min(1.0, width / max(shape))
-
-
-def shrunk(gray: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Return a picture shrunk by a factor. Its point x is at (x + 0.5) / factor - 0.5 of the picture."""
-    if factor == 1.0:
-        return gray
-    size = (round(gray.shape[1] * factor), round(gray.shape[0] * factor))
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
+    xy, descriptors = sift(gray, settings.count, settings.width or None)
+    return Features(xy, descriptors, points_at(xy, depth, camera))
 
 
 def points_at(xy: Floats, depth: Floats, camera: Camera) -> Floats:
@@ -97,19 +75,6 @@ def match(a: NDArray[np.uint8], b: NDArray[np.uint8], ratio: float) -> NDArray[n
     if a.shape[1] != SIFT_WIDTH:
         ratio = max(ratio, LEARNED_RATIO)
     return nearest_pairs(root_sift(a), root_sift(b), ratio)
-
-
-def nearest_pairs(a: Floats, b: Floats, ratio: float) -> NDArray[np.int64]:
-    """Mutual nearest neighbours of unit descriptors (N, D), (M, D) that pass the ratio test. Shape (K, 2)."""
-    if len(a) < 2 or len(b) < 2:
-        return np.zeros((0, 2), np.int64)
-    likeness = a @ b.T
-    forth, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
-    rows = np.flatnonzero(back[forth] == np.arange(len(a)))
-    top = np.partition(likeness[rows], -2, axis=1)[:, -2:]
-    distance = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
-    rows = rows[distance[:, 1] < ratio * distance[:, 0]]
-    return np.stack([rows, forth[rows]], axis=1)
 
 
 def relative_pose(

@@ -13,8 +13,6 @@ class FeatureSettings:
     """Pictures are shrunk to at most this many px on their longer side; 0 keeps their size."""
     count: int = 400
     """Most features on a frame."""
-    contrast: float = 0.015
-    """SIFT's contrast threshold; low, so that plain rooms give some."""
     ratio: float = 0.85
     """Lowe's ratio of best to second best distance."""
     trials: int = 400

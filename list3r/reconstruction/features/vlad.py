@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.sift import root_sift
+
 Floats = NDArray[np.float32]
 
 
@@ -61,12 +63,3 @@ def describe_rooted(rooted: Floats) -> Floats:
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
     rooted = np.sign(sums) * np.sqrt(np.abs(sums))
     return np.asarray(rooted.ravel() / max(float(np.linalg.norm(rooted)), 1e-9), np.float32)
-
-
-def root_sift(descriptors: NDArray[np.uint8]) -> Floats:
-    """Square roots of SIFT descriptors of unit sum, shape (N, 128).
-
-    RootSIFT: Arandjelovic, Zisserman, "Three things everyone should know to improve object retrieval", 2012.
-    """
-    x = descriptors.astype(np.float32)
-    return np.asarray(np.sqrt(x / np.maximum(x.sum(axis=1, keepdims=True), np.float32(1e-6))))

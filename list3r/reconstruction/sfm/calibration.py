@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -214,7 +213,7 @@ def map_window(
     frames = [f for f in source.read(start, stop) if not isinstance(f, BadFrame)]
     if len(frames) < 2:
         return None
-    grays = [np.asarray(cv2.cvtColor(f.color, cv2.COLOR_RGB2GRAY), np.uint8) for f in frames]
+    grays = [f.gray() for f in frames]
     tracks = _longest_run(follow_corners(grays, settings.tracks))
     if len(tracks.keyframes) < 3:
         return None

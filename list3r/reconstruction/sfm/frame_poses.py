@@ -15,7 +15,7 @@ from list3r.reconstruction.poses import small_motion
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap
 from list3r.reconstruction.sfm.kernels import pose_equations
 from list3r.reconstruction.sfm.mapping import Poses, SparseMap
-from list3r.reconstruction.sfm.settings import FramePoseSettings
+from list3r.reconstruction.sfm.settings import SEED, FramePoseSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 Floats = NDArray[np.float32]
@@ -121,7 +121,7 @@ def pose_of(
         if found is not None and found[1].mean() > settings.refined_share:
             return found
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, settings.seed, 1
+    options.ransac.max_error, options.ransac.random_seed, options.ransac.num_threads = gate, SEED, 1
     guess = pycolmap.estimate_and_refine_absolute_pose(px, points, lens, options)
     if guess is None or guess["num_inliers"] < settings.least_matches:
         return None

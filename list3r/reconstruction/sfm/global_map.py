@@ -30,7 +30,7 @@ from list3r.reconstruction.sfm.mapping import (
     without_context,
 )
 from list3r.reconstruction.sfm.pure_rotation import only_turns
-from list3r.reconstruction.sfm.settings import MappingSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, SEED, MappingSettings
 
 
 def with_global_map(
@@ -41,10 +41,8 @@ def with_global_map(
     Where rotations may have lost their scale, or they separate keyframes with matches, they are adjusted once more with
     new points, or replaced by a global map that explains as many observations. `verified` is as for `correspondences`.
     """
-    if not maps or settings.turned_scale <= 0.0:
-        return list(maps)
     turned = any(scale_lost_at_turns(m) >= settings.turned_scale for m in maps)
-    if not turned and not _left_apart(maps, problem, settings, problem.pairs if verified is None else verified):
+    if not turned and not _left_apart(maps, problem, problem.pairs if verified is None else verified):
         return list(maps)
     anew = [adjusted(problem, camera, m.T_map_cam, settings, verified) or m for m in maps]
     found = global_map(problem, camera, settings, verified)
@@ -56,11 +54,11 @@ def with_global_map(
     return sorted(anew, key=lambda m: -len(m.T_map_cam))
 
 
-def _left_apart(maps: Sequence[SparseMap], problem: MapProblem, settings: MappingSettings, pairs: Matches) -> bool:
+def _left_apart(maps: Sequence[SparseMap], problem: MapProblem, pairs: Matches) -> bool:
     """Return whether a keyframe shares enough matches with one in another map, or in none."""
     of = {key: n for n, m in enumerate(maps) for key in m.T_map_cam}
     return any(
-        len(rows) >= settings.least_matches and of.get(a) != of.get(b) and not {a, b} & problem.context
+        len(rows) >= LEAST_MATCHES and of.get(a) != of.get(b) and not {a, b} & problem.context
         for (a, b), rows in pairs.items()
     )
 
@@ -91,15 +89,15 @@ def global_map(
     if database is None:
         return None
     manager = pycolmap.ReconstructionManager()
-    pycolmap.GlobalPipeline(_options(settings), database, manager).run()
+    pycolmap.GlobalPipeline(_options(), database, manager).run()
     made = [sparse_map(manager.get(k), problem, camera) for k in range(manager.size())]
     largest = max(made, key=lambda m: len(m.T_map_cam), default=None)
     if largest is None:
         return None
-    found = adjusted(problem, camera, _held(largest, settings), settings, verified)
+    found = adjusted(problem, camera, _held(largest), settings, verified)
     if found is None:
         return None
-    poses = _held(found, settings)
+    poses = _held(found)
     found = without_context(replace(found, T_map_cam=poses, seen={k: found.seen[k] for k in poses}), problem)
     places = {key: view.xy for key, view in problem.views.items()}
     if len(found.T_map_cam) < 2 or only_turns(places, problem.pairs, found.T_map_cam, camera, settings.turning):
@@ -107,18 +105,18 @@ def global_map(
     return found
 
 
-def _held(found: SparseMap, settings: MappingSettings) -> dict[int, Poses]:
+def _held(found: SparseMap) -> dict[int, Poses]:
     """Poses of the keyframes with enough observed points."""
-    return {key: T for key, T in found.T_map_cam.items() if len(found.seen[key].ids) >= settings.least_matches}
+    return {key: T for key, T in found.T_map_cam.items() if len(found.seen[key].ids) >= LEAST_MATCHES}
 
 
-def _options(settings: MappingSettings) -> Any:
+def _options() -> Any:
     """Return pycolmap's options: its defaults, but for a known camera, and deterministic."""
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads, options.random_seed, options.min_num_matches = 1, settings.seed, settings.least_matches
+    options.num_threads, options.random_seed, options.min_num_matches = 1, SEED, LEAST_MATCHES
     mapper = options.mapper
-    mapper.num_threads, mapper.random_seed = 1, settings.seed
-    mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = settings.seed
+    mapper.num_threads, mapper.random_seed = 1, SEED
+    mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = SEED
     mapper.global_positioning.use_gpu, mapper.retriangulation.ignore_two_view_tracks = False, False
     adjustment = mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_extra_params = False

@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.sift import RATIO, nearest_pairs, root_sift, sift
 from list3r.reconstruction.features.learned import LearnedDetector
-from list3r.reconstruction.features.local import LEARNED_RATIO, nearest_pairs, shrinkage, shrunk
-from list3r.reconstruction.features.vlad import root_sift
+from list3r.reconstruction.features.local import LEARNED_RATIO
 from list3r.reconstruction.sfm.settings import FinderSettings
 
 Floats = NDArray[np.float32]
@@ -59,17 +58,9 @@ def make_finder(
 
 def sift_features(gray: NDArray[np.uint8], settings: FinderSettings) -> LocalFeatures:
     """SIFT features of a grey picture, one per position."""
-    factor = shrinkage(gray.shape, settings.width)
-    sift = cv2.SIFT.create(nfeatures=settings.count, contrastThreshold=settings.contrast)
-    keypoints, descriptors = sift.detectAndCompute(shrunk(gray, factor), None)
-    if descriptors is None:
-        return LocalFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), settings.ratio)
-    xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
-    order = np.lexsort((xy[:, 0], xy[:, 1], -np.array([k.response for k in keypoints])))[: settings.count]
-    _, single = np.unique(xy[order], axis=0, return_index=True)
-    order = order[np.sort(single)]
-    place = (xy[order] + np.float32(0.5)) / np.float32(factor) - np.float32(0.5)
-    return LocalFeatures(place, root_sift(descriptors[order].astype(np.uint8)), settings.ratio)
+    xy, descriptors = sift(gray, settings.count, settings.width, settings.contrast)
+    single = np.sort(np.unique(xy, axis=0, return_index=True)[1])
+    return LocalFeatures(xy[single], root_sift(descriptors[single]), RATIO)
 
 
 def match_features(a: LocalFeatures, b: LocalFeatures) -> Ints:

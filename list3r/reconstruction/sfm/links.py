@@ -7,13 +7,13 @@ features as well, because corners alone deform a chunk with little motion (resea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from list3r.reconstruction.sfm.keyframe_features import Finder, likely_pairs, make_finder, match_features
+from list3r.reconstruction.sfm.keyframe_features import Finder, LocalFeatures, likely_pairs, make_finder, match_features
 from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, shared_rows
-from list3r.reconstruction.sfm.settings import LinkSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, LinkSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks, Gray
 
 _FEATURE_IDS = 1_000_000
@@ -31,20 +31,20 @@ def keyframe_problem(
     `finder` finds features where tracks do not reach; None takes SIFT.
     """
     chosen = settings or LinkSettings()
-    problem = corner_problem(tracks, chosen)
+    problem = corner_problem(tracks)
     if len(np.unique(tracks.run[list(tracks.keyframes)])) < 2:
         return problem
     return with_features(problem, finder or make_finder(grays, None, None, chosen.features), chosen)
 
 
-def corner_problem(tracks: CornerTracks, settings: LinkSettings) -> MapProblem:
+def corner_problem(tracks: CornerTracks) -> MapProblem:
     """Return the keyframes of a chunk with their tracked corners alone."""
     views = {k: KeyframeView(tracks.ids[k], tracks.xy[k]) for k in tracks.keyframes}
     pairs = {}
     for n, a in enumerate(tracks.keyframes):
         for b in tracks.keyframes[n + 1 :]:
             rows = shared_rows(views[a], views[b]) if tracks.run[a] == tracks.run[b] else _NO_ROWS
-            if len(rows) >= settings.least_matches:
+            if len(rows) >= LEAST_MATCHES:
                 pairs[a, b] = rows
     return MapProblem(views, pairs)
 
@@ -64,20 +64,13 @@ def with_neighbours(
     """
     order = [*before, *sorted(problem.views), *behind]
     found = {key: finder(key) for key in order}
-    none = KeyframeView(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-    views, first = {}, {}
-    for key, features in found.items():
-        view = problem.views.get(key, none)
-        first[key] = len(view.ids)
-        ids = _FEATURE_IDS * (key + 1) + _AHEAD_IDS + np.arange(len(features.xy))
-        xy = np.concatenate([view.xy, features.xy]).astype(np.float32)
-        views[key] = KeyframeView(np.concatenate([view.ids, ids]), xy)
+    views, first = _joined(problem.views, found, _AHEAD_IDS)
     pairs, matched = dict(problem.pairs), set(problem.matched)
     for n, one in enumerate(order):
         for other in order[n + 1 : n + 1 + settings.ahead]:
             a, b = min(one, other), max(one, other)
             rows = match_features(found[a], found[b])
-            if len(rows) < settings.least_matches:
+            if len(rows) < LEAST_MATCHES:
                 continue
             rows = rows + np.array([first[a], first[b]])
             if (a, b) not in pairs:
@@ -88,15 +81,24 @@ def with_neighbours(
 
 def with_features(problem: MapProblem, finder: Finder, settings: LinkSettings) -> MapProblem:
     """Return the problem with similar keyframes that share no tracks matched by features."""
-    views, pairs = dict(problem.views), dict(problem.pairs)
-    found = {key: finder(key) for key in sorted(views)}
-    first = {key: len(view.ids) for key, view in views.items()}
-    for key, features in found.items():
-        view, ids = views[key], _FEATURE_IDS * (key + 1) + np.arange(len(features.xy))
-        xy = np.concatenate([view.xy, features.xy]).astype(np.float32)
-        views[key] = KeyframeView(np.concatenate([view.ids, ids]), xy)
+    pairs, found = dict(problem.pairs), {key: finder(key) for key in sorted(problem.views)}
+    views, first = _joined(problem.views, found, 0)
     for a, b in likely_pairs(found, set(pairs), settings.features):
         rows = match_features(found[a], found[b])
-        if len(rows) >= settings.least_matches:
+        if len(rows) >= LEAST_MATCHES:
             pairs[a, b] = rows + np.array([first[a], first[b]])
     return MapProblem(views, pairs, frozenset(set(pairs) - set(problem.pairs)))
+
+
+def _joined(
+    views: Mapping[int, KeyframeView], found: Mapping[int, LocalFeatures], from_id: int
+) -> tuple[dict[int, KeyframeView], dict[int, int]]:
+    """Return keyframes with features behind their corners, and where in each these begin."""
+    out, first = {}, {}
+    for key, features in found.items():
+        view = views.get(key, KeyframeView(np.zeros(0, np.int64), np.zeros((0, 2), np.float32)))
+        first[key] = len(view.ids)
+        ids = _FEATURE_IDS * (key + 1) + from_id + np.arange(len(features.xy))
+        xy = np.concatenate([view.xy, features.xy]).astype(np.float32)
+        out[key] = KeyframeView(np.concatenate([view.ids, ids]), xy)
+    return out, first

@@ -2,16 +2,14 @@
 
 Nothing is written to the disk: the correspondences are in a database in memory. pycolmap's pixels have their origin at
 the corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
-correspondences give the same structure. Growing a map is a local search, so maps are grown from pairs in up to three
-places of a chunk (research/colour-video 0064), roughly, and the kept one is adjusted once it is complete
-(research/colour-video 0181).
+correspondences give the same structure. A map is grown roughly and adjusted once it is complete (research/colour-video
+0181).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,7 @@ from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import inverse, make_lens, matrix_of, pixel_unit, pycolmap, rigid_of
 from list3r.reconstruction.sfm.consistency import contradicted
 from list3r.reconstruction.sfm.pure_rotation import only_turns
-from list3r.reconstruction.sfm.settings import MappingSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, SEED, MappingSettings
 
 Poses = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -102,37 +100,9 @@ def build_maps(
     if cache is None:
         return []
     work = _Work(cache, problem, camera, free_camera, chosen)
-    grown: list[list[SparseMap]] = []
-    models: dict[int, Any] = {}
-    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
-        made = _grown(work, pair)
-        maps = [found for found, _ in made]
-        own = [(without_context(found, problem), model) for found, model in made]
-        own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
-        grown.append([found for found, _ in own])
-        models |= {id(found): model for found, model in own}
-        if agreed(grown, chosen) or (maps and all(steady(m, chosen.steady) for m in maps)):
-            break
-        if not maps and pair is None and work.only_turns(problem.views):
-            break
-    best = best_of(grown, chosen.alike)
-    held = {key for found in best for key in found.T_map_cam}
-    kept = [*best, *(found for found in grown[0] if not held & found.T_map_cam.keys())]
-    return [_finished(work, found, models[id(found)]) for found in kept]
-
-
-def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[int, int]]:
-    """Further initial pairs of keyframes: those that share most in the second and the last third."""
-    own = sorted(problem.views.keys() - problem.context)
-    place = {key: n for n, key in enumerate(own)}
-    least, most = settings.given_steps
-    out = []
-    for third in (1, 2):
-        part = own[third * len(own) // 3 : (third + 1) * len(own) // 3]
-        steps = {p: place[p[1]] - place[p[0]] for p in problem.pairs if p[0] in part and p[1] in place}
-        near = [(len(problem.pairs[p]), p) for p, step in sorted(steps.items()) if least <= step <= most]
-        out += [max(near)[1]] if near else []
-    return out
+    own = [(without_context(found, problem), model) for found, model in _grown(work)]
+    own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
+    return [_finished(work, found, model) for found, model in own]
 
 
 @dataclass(frozen=True)
@@ -144,36 +114,24 @@ class _Work:
     camera: Camera
     free_camera: str
     settings: MappingSettings
-    turns: dict[frozenset[int], bool] = field(default_factory=dict)
-    """Whether the camera only rotates in some of the views, as far as it was tested."""
-
-    def only_turns(self, keys: Collection[int]) -> bool:
-        """Return whether the camera only rotates in some of the views."""
-        some = frozenset(keys)
-        if some not in self.turns:
-            places = {key: view.xy for key, view in self.problem.views.items()}
-            self.turns[some] = only_turns(places, self.problem.pairs, keys, self.camera, self.settings.turning)
-        return self.turns[some]
 
 
-def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, Any]]:
-    """Maps that grow from two keyframes, one from a given pair, each with pycolmap's own; none of a camera that only
-    rotates."""
+def _grown(work: _Work) -> list[tuple[SparseMap, Any]]:
+    """Maps that grow from two keyframes, each with pycolmap's own; none of a camera that only rotates."""
     settings = work.settings
     options = mapper_options(work.camera, work.free_camera, settings)
     if settings.rough_iterations:
         options.ba_global_max_num_iterations = settings.rough_iterations
         options.ba_global_max_refinements = 1
-    given = pair is not None or work.free_camera == "focal"
-    options.mapper.init_min_tri_angle = settings.given_angle_deg if given else settings.first_angle_deg
-    if pair is not None:
-        options.init_image_id1, options.init_image_id2 = pair[0] + 1, pair[1] + 1
-        options.max_num_models = 1
+    free = work.free_camera == "focal"
+    options.mapper.init_min_tri_angle = settings.free_angle_deg if free else settings.first_angle_deg
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, work.cache, manager).run()
     models = [manager.get(k) for k in range(manager.size())]
     maps = [(m, model) for m, model in ((_map_of(work, model), model) for model in models) if _enough(m, settings)]
-    return [(m, model) for m, model in maps if not work.only_turns(m.T_map_cam)]
+    places = {key: view.xy for key, view in work.problem.views.items()}
+    pairs, camera = work.problem.pairs, work.camera
+    return [(m, model) for m, model in maps if not only_turns(places, pairs, m.T_map_cam, camera, settings.turning)]
 
 
 def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
@@ -225,37 +183,6 @@ def without_context(found: SparseMap, problem: MapProblem) -> SparseMap:
     poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.context}
     seen = {k: view for k, view in found.seen.items() if k not in problem.context}
     return replace(found, T_map_cam=poses, seen=seen)
-
-
-def steady(found: SparseMap, most: float) -> bool:
-    """Return whether the depth of keyframes' points changes by less than a factor from one to the next.
-
-    A map that lost its scale where the camera rotated explains the pictures as well, but there depth jumps (decision
-    0128).
-    """
-    if most <= 1.0:
-        return False
-    deep = []
-    for key, T in sorted(found.T_map_cam.items()):
-        points = np.array([found.points[n] for n in found.seen[key].ids.tolist()]).reshape(-1, 3)
-        deep += [float(np.median(np.linalg.norm(points - T[:3, 3], axis=1)))] if len(points) else []
-    return bool(np.abs(np.diff(np.log(deep))).max(initial=0.0) <= np.log(most))
-
-
-def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
-    """Return whether two unbroken maps hold as many keyframes and explain the pictures equally well.
-
-    Deformed maps may agree too, but where a map is deformed some part of it often does not fit.
-    """
-    largest = [(len(maps[0].T_map_cam), maps[0].error_px) for maps in grown if len(maps) == 1]
-    return any(a == b and max(e, f) <= settings.same_error * min(e, f) for (a, e), (b, f) in combinations(largest, 2))
-
-
-def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
-    """Return the maps whose largest one has the least error among those about as large as any."""
-    most = max((len(maps[0].T_map_cam) for maps in grown if maps), default=0)
-    large = [maps for maps in grown if maps and len(maps[0].T_map_cam) >= alike * most]
-    return min(large, key=lambda maps: maps[0].error_px, default=[])
 
 
 def _borne_out(found: SparseMap, work: _Work) -> SparseMap:
@@ -358,7 +285,7 @@ def correspondences(
     if database is None:
         return None
     options = pycolmap.DatabaseCacheOptions()
-    options.min_num_matches = settings.least_matches
+    options.min_num_matches = LEAST_MATCHES
     return pycolmap.DatabaseCache.create(database, options)
 
 
@@ -391,7 +318,7 @@ def database_of(
             found.inlier_matches = verified.get((a, b), rows[:0]).astype(np.uint32)
         else:
             found = _two_view(problem, (a, b), lens, camera, free_camera, settings)
-        wanted = max(settings.least_matches, settings.matched_share * len(rows) if matched else 0.0)
+        wanted = max(LEAST_MATCHES, settings.matched_share * len(rows) if matched else 0.0)
         if found is not None and len(found.inlier_matches) >= wanted:
             database.write_matches(a + 1, b + 1, rows.astype(np.uint32))
             database.write_two_view_geometry(a + 1, b + 1, found)
@@ -403,12 +330,12 @@ def _two_view(
     problem: MapProblem, pair: tuple[int, int], lens: Any, camera: Camera, free_camera: str, settings: MappingSettings
 ) -> Any:
     rows = problem.pairs[pair]
-    if len(rows) < settings.least_matches:
+    if len(rows) < LEAST_MATCHES:
         return None
     options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers, options.detect_watermark = settings.least_matches, False
+    options.min_num_inliers, options.detect_watermark = LEAST_MATCHES, False
     options.ransac.max_error = settings.pair_error_px * pixel_unit(camera) * (2.0 if free_camera else 1.0)
-    options.ransac.random_seed, options.ransac.num_threads = settings.seed, 1
+    options.ransac.random_seed, options.ransac.num_threads = SEED, 1
     if pair in problem.matched:
         options.min_E_F_inlier_ratio, options.ransac.min_inlier_ratio = 0.0, settings.matched_share
     calibrated, free = pycolmap.estimate_calibrated_two_view_geometry, pycolmap.estimate_two_view_geometry
@@ -420,8 +347,8 @@ def _two_view(
 def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) -> Any:
     """Return pycolmap's options for growing and filtering a map."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.extract_colors = 1, settings.seed, False
-    options.min_num_matches, options.min_model_size = settings.least_matches, 2
+    options.num_threads, options.random_seed, options.extract_colors = 1, SEED, False
+    options.min_num_matches, options.min_model_size = LEAST_MATCHES, 2
     options.init_num_trials, options.max_num_models = 50, 10
     options.ba_refine_focal_length = free_camera == "focal"
     options.ba_refine_extra_params = bool(free_camera)
@@ -433,10 +360,10 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = settings.tolerance
     options.ba_global_frames_ratio = options.ba_global_points_ratio = settings.growth
     mapper, unit = options.mapper, pixel_unit(camera)
-    mapper.num_threads, mapper.random_seed = 1, settings.seed
-    mapper.init_min_num_inliers = 2 * settings.least_matches
+    mapper.num_threads, mapper.random_seed = 1, SEED
+    mapper.init_min_num_inliers = 2 * LEAST_MATCHES
     mapper.init_max_error = settings.pair_error_px * unit * (2.0 if free_camera else 1.0)
-    mapper.abs_pose_min_num_inliers = settings.least_matches
+    mapper.abs_pose_min_num_inliers = LEAST_MATCHES
     mapper.abs_pose_max_error = settings.pose_error_px * unit
     mapper.abs_pose_refine_focal_length = free_camera == "focal"
     mapper.abs_pose_refine_extra_params = bool(free_camera)
@@ -445,7 +372,7 @@ def mapper_options(camera: Camera, free_camera: str, settings: MappingSettings) 
     mapper.ba_local_min_tri_angle, mapper.ba_local_num_images = 2.0, settings.part_views
     options.triangulation.min_angle = settings.point_angle_deg
     options.triangulation.ignore_two_view_tracks = False
-    options.triangulation.random_seed = settings.seed
+    options.triangulation.random_seed = SEED
     return options
 
 

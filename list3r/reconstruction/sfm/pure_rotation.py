@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from list3r.frames.base import Camera
-from list3r.reconstruction.sfm.settings import PureRotationSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, PureRotationSettings
 
 Floats = NDArray[np.float64]
 Places = Mapping[int, NDArray[np.float32]]
@@ -57,7 +57,7 @@ def _farthest_pairs(
     """Common pixels of views spread over the video and the last view that shares enough with each."""
     last = {}
     for (a, b), rows in sorted(pairs.items()):
-        if a in keys and b in keys and len(rows) >= settings.least_matches:
+        if a in keys and b in keys and len(rows) >= LEAST_MATCHES:
             last[a] = b
     rows_of = [(a, b, pairs[a, b]) for a, b in sorted(last.items())]
     rows_of = rows_of[:: max(1, len(rows_of) // settings.most_pairs)]

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.frames.base import Camera, Frame
-from list3r.frames.decoding.picture import gray_of
 from list3r.memory.core.errors import BaselineError, OptionError, TrackingError
 from list3r.models.device import find_gpu
 from list3r.reconstruction.base import Around, PosedOnly, Reconstruction
@@ -72,7 +71,7 @@ class SfmReconstructor:
 
         Raises `TrackingError` when the camera cannot be tracked through any two frames, with the reason.
         """
-        grays = [gray_of(f) for f in frames]
+        grays = [f.gray() for f in frames]
         return self._finish(frames, self._segments(frames, grays, camera)[0])
 
     def parts(
@@ -87,7 +86,7 @@ class SfmReconstructor:
         With `around` some frames before and behind the chunk are mapped with it. With `deep` only the frames of these
         numbers get depth, and the others a pose. Raises `TrackingError` as above.
         """
-        grays = [gray_of(f) for f in frames]
+        grays = [f.gray() for f in frames]
         first, *others = self._segments(frames, grays, camera, around)
         others = [s for s in others if len(s.T_map_cam) >= self.settings.least_segment]
         elsewhere = {k for s in others for k in s.T_map_cam}
@@ -104,8 +103,8 @@ class SfmReconstructor:
         known = {k: T_map_cam[f.index] for k, f in enumerate(frames) if f.index in T_map_cam}
         if not known:
             raise TrackingError(f"{_span(frames)}: the map of the whole video does not hold them")
-        tracks = follow_corners([gray_of(f) for f in frames], self.settings.tracks)
-        problem = corner_problem(tracks, self.settings.links)
+        tracks = follow_corners([f.gray() for f in frames], self.settings.tracks)
+        problem = corner_problem(tracks)
         gate = self.settings.mapping.pose_error_px * pixel_unit(camera)
         verified = agreeing_rows(problem, camera, known, gate)
         return self._finish(frames, self._triangulated(tracks, problem, camera, known, verified), in_place=True)
@@ -143,7 +142,7 @@ class SfmReconstructor:
         early, late = np.split(len(frames) + np.arange(len(context)), [len(before)])
         count = s.links.ahead_features
         few = replace(s.links.features, width=s.links.ahead_width, count=count, learned_count=count)
-        seen, colors = [*grays, *map(gray_of, context)], [f.color for f in (*frames, *context)]
+        seen, colors = [*grays, *(f.gray() for f in context)], [f.color for f in (*frames, *context)]
         finder = make_finder(seen, colors, self.detector, few)
         wider = with_neighbours(problem, early.tolist(), late.tolist(), finder, s.links)
         if not self.camera_known:

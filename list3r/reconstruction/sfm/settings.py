@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from list3r.frames.sift import CONTRAST
 from list3r.reconstruction.base import KeyframeSpacing
 from list3r.reconstruction.mvs.settings import MvsSettings
 
+LEAST_MATCHES = 20
+"""Fewest corners or features that two pictures must share."""
+SEED = 1
+"""Of all random samples."""
 MIDDLE_DEPTH = 2.0
 """Median depth to which a chunk is scaled."""
 
@@ -68,10 +73,8 @@ class FinderSettings:
     """SIFT features of a keyframe."""
     learned_count: int = 1200
     """Learned ones."""
-    contrast: float = 0.015
+    contrast: float = CONTRAST
     """SIFT's contrast threshold."""
-    ratio: float = 0.85
-    """Lowe's ratio of SIFT."""
     few: int = 300
     """The best features, by which keyframes worth matching are chosen."""
     least_few: int = 4
@@ -85,8 +88,6 @@ class LinkSettings:
     """Which keyframes are matched, and how features are found."""
 
     features: FinderSettings = field(default_factory=FinderSettings)
-    least_matches: int = 20
-    """Fewest shared corners or features of a pair."""
     context: int = 8
     """Frames on either side of a chunk that are mapped with it."""
     context_step: float = 2.0
@@ -120,8 +121,6 @@ class PureRotationSettings:
     """Usual error of matches, px of a picture 640 wide."""
     share: float = 0.8
     """Share of the matches that must be explained."""
-    least_matches: int = 20
-    """Fewest matches of a pair."""
     most_pairs: int = 16
     """About the most pairs that are tested, spread evenly."""
     focal_ratio: float = 1.6
@@ -134,8 +133,6 @@ class PureRotationSettings:
 class MappingSettings:
     """How keyframes become a map. Errors in px of a picture 640 wide."""
 
-    least_matches: int = 20
-    """Fewest correspondences of two keyframes that count."""
     matched_share: float = 1.0 / 3.0
     """Share of two keyframes' descriptor matches that must agree on their geometry. On redkitchen (every 20th and
     30th frame) and simulated walks 99 % of the right pairs have 0.34 and more; chance pairs 0.2 to 0.3."""
@@ -149,18 +146,8 @@ class MappingSettings:
     """Largest error of an observation that is kept."""
     first_angle_deg: float = 6.0
     """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
-    given_angle_deg: float = 3.0
-    """The same where the pair is given, or the camera is estimated as well."""
-    given_steps: tuple[int, int] = (4, 7)
-    """Fewest and most keyframes from the first to the second one of a given pair."""
-    given_pairs: int = 2
-    """Most pairs from which a map is grown in addition to the one that the mapper chooses."""
-    steady: float = 0.0
-    """No other pair is tried where the points' depth changes by less than this factor from each keyframe to the next;
-    0 for maps that are always compared with others."""
-    same_error: float = 1.005
-    """Two maps of errors within this ratio are the same, and no third is grown: right ones of one chunk differ by 0.1
-    to 0.7 %, deformed ones are 9 to 12 % off (simulated walks 101 to 104)."""
+    free_angle_deg: float = 3.0
+    """The same where the camera is estimated as well."""
     growth: float = 1.4
     """The whole map is adjusted each time it has grown by this factor."""
     whole_iterations: int = 25
@@ -178,17 +165,14 @@ class MappingSettings:
     when it is complete. 0 for maps that are always adjusted so."""
     tolerance: float = 0.0
     """Adjustments end when a step gains less than this share of the error."""
-    turned_scale: float = 0.0
+    turned_scale: float = 0.05
     """A map of all keyframes at once is tried where rotations lose that much of the scale, or maps separate keyframes
-    with matches; 0 for never. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046
-    (research/colour-video 0208)."""
-    alike: float = 0.95
-    """Maps with at least this share of the keyframes of the largest are compared by their error."""
+    with matches. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046 (research/colour-video 0208).
+    """
     point_angle_deg: float = 1.0
     """Least angle between the rays to a point."""
     least_points: int = 40
     """Fewest points of an accepted map."""
-    seed: int = 1
     consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
     turning: PureRotationSettings = field(default_factory=PureRotationSettings)
 
@@ -219,7 +203,7 @@ class FramePoseSettings:
     """Frames without corners in a row, between two posed ones, that are posed by tracking known points."""
     bridge_window_px: int = 31
     """Window in which these are tracked."""
-    least_matches: int = 20
+    least_matches: int = LEAST_MATCHES
     """Fewest points of the map that a frame must see."""
     pose_error_px: float = 4.0
     """Largest error of a pose's inlier, px of a picture 640 wide."""
@@ -233,7 +217,6 @@ class FramePoseSettings:
     """Largest distance from its start of a point of a bridged frame that is tracked back, px."""
     least_inliers: int = 12
     """Fewest inliers of a pose."""
-    seed: int = 1
 
 
 @dataclass(frozen=True)
@@ -292,7 +275,6 @@ def maps_of_chunks() -> MappingSettings:
         part_rounds=1,
         part_views=4,
         rough_iterations=10,
-        turned_scale=0.05,
     )
 
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.reconstruction.features.local import shrinkage, shrunk
+from list3r.frames.sift import shrinkage, shrunk
 from list3r.reconstruction.sfm.settings import CornerSettings
 
 Gray = NDArray[np.uint8]

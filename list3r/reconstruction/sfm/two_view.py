@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from list3r.frames.base import Camera
 from list3r.reconstruction.sfm.colmap import pixel_unit
 from list3r.reconstruction.sfm.mapping import MapProblem
-from list3r.reconstruction.sfm.settings import MappingSettings
+from list3r.reconstruction.sfm.settings import LEAST_MATCHES, MappingSettings
 
 
 def verified_rows(
@@ -24,7 +24,7 @@ def verified_rows(
     gate = settings.pair_error_px * pixel_unit(camera)
     out = {}
     for (a, b), rows in problem.pairs.items():
-        if len(rows) < settings.least_matches:
+        if len(rows) < LEAST_MATCHES:
             continue
         one = problem.views[a].xy[rows[:, 0]].astype(np.float64)
         two = problem.views[b].xy[rows[:, 1]].astype(np.float64)

@@ -6,19 +6,18 @@ up, depth in millimetres, confidence 0, 127 or 255. The optimised cameras (`corr
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from list3r.frames.layout import VARIES, FolderLayout, Optics, own_camera, pose_matrix, read_json, there, varies_note
-from list3r.frames.listing import FrameFile, FrameFiles
-from list3r.frames.options import SourceOptions, check_intrinsics
+from list3r.frames.layout import FolderLayout, pose_matrix, read_json
+from list3r.frames.listing import FrameFile
+from list3r.frames.options import SourceOptions
+from list3r.frames.readers.phones.scan import scan_layout, there
 from list3r.frames.recordings.axes import pose_of_arkit
-from list3r.memory.core.errors import OptionError, SourceError
-
-LEAST_CONFIDENCE = 1
-"""Depth of confidence 0 is unknown (stored 0, 127, 255 for 0, 1, 2)."""
+from list3r.memory.core.errors import SourceError
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:
@@ -33,43 +32,19 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
         return None
     colors = sorted(images.glob("*.jpg"), key=lambda p: (len(p.stem), p.stem))
     rows = [(color, *_camera(cameras / f"{color.stem}.json")) for color in colors]
-    known = np.array([stated for _, stated, _ in rows if stated is not None])
-    if not len(known):
-        raise SourceError(f"{cameras} states the camera of no picture; is the copy complete?")
-    fx, fy, cx, cy, width, height = np.median(known, axis=0).tolist()
-    spread = float(np.ptp(known[:, 0]) / fx) if fx > 0 and options.intrinsics is None else 0.0
-    files = FrameFiles(
+    files = [
         FrameFile(
             color,
             there(base / "depth" / f"{color.stem}.png"),
             T_source_camera=pose,
             time_s=1e-6 * int(color.stem) if color.stem.isdigit() else None,
             confidence=there(base / "confidence" / f"{color.stem}.png"),
-            lens=own_camera(stated, cameras) if stated is not None and spread > VARIES else None,
         )
-        for color, stated, pose in rows
-    )
-    notes = ["cameras of Polycam" + (", optimised by it" if optimised else " as ARKit tracked them")]
-    if spread > VARIES:
-        notes.append(varies_note(spread, carried=True))
-    try:
-        intrinsics = options.intrinsics or check_intrinsics([fx, fy, cx, cy])
-    except OptionError as error:
-        raise SourceError(f"{cameras}: {error}") from None
-    size = (round(height), round(width))
-    optics = Optics(intrinsics, depth_scale=1000.0, intrinsics_size=size, shares_view=True)
-    return FolderLayout(
-        "polycam",
-        files,
-        optics,
-        "color",
-        intrinsics,
-        tuple(notes),
-        least_confidence=LEAST_CONFIDENCE,
-        z_up=True,
-        poses_drift=not optimised,
-        upright_tags=False,
-    )
+        for color, _, pose in rows
+    ]
+    note = "cameras of Polycam" + (", optimised by it" if optimised else " as ARKit tracked them")
+    layout = scan_layout("polycam", files, [stated for _, stated, _ in rows], cameras, options, note)
+    return replace(layout, poses_drift=not optimised)
 
 
 def _camera(path: Path) -> tuple[list[float] | None, NDArray[np.float64] | None]:

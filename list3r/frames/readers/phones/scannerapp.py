@@ -7,20 +7,21 @@ row by row with ARKit's axes and y up. Depth is in millimetres, confidence 0, 1,
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from list3r.frames.beside import listed
-from list3r.frames.layout import VARIES, FolderLayout, Optics, pose_matrix, read_json, there, varies_note
-from list3r.frames.listing import FrameFile, FrameFiles
-from list3r.frames.options import SourceOptions, check_intrinsics, intrinsics_of_matrix
+from list3r.frames.layout import FolderLayout, pose_matrix, read_json
+from list3r.frames.listing import FrameFile
+from list3r.frames.options import SourceOptions, intrinsics_of_matrix
+from list3r.frames.readers.phones.scan import scan_layout, there
 from list3r.frames.recordings.axes import pose_of_arkit
 from list3r.memory.core.errors import OptionError, SourceError
 
 _PICTURE = re.compile(r"frame_(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
-_LEAST_CONFIDENCE = 1
 
 
 def find(root: Path, options: SourceOptions) -> FolderLayout | None:
@@ -30,10 +31,7 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
     if not colors or not any(path.is_file() for path in tables.values()):
         return None
     stated = {p: _table(path) for p, path in tables.items() if path.is_file()}
-    known = np.array([row[0] for row in stated.values()])
-    intrinsics = check_intrinsics(np.median(known, axis=0).tolist())
-    spread = float(np.ptp(known[:, 0]) / intrinsics[0])
-    files = FrameFiles(
+    files = [
         FrameFile(
             p,
             there(root / f"depth_{p.stem[6:]}.png"),
@@ -42,23 +40,10 @@ def find(root: Path, options: SourceOptions) -> FolderLayout | None:
             confidence=there(root / f"conf_{p.stem[6:]}.png"),
         )
         for p in colors
-    )
-    notes = ["cameras and poses of 3D Scanner App (ARKit)"]
-    if spread > VARIES:
-        notes.append(varies_note(spread, carried=False))
-    return FolderLayout(
-        "scannerapp",
-        files,
-        Optics(options.intrinsics or intrinsics, depth_scale=1000.0, shares_view=True),
-        "color",
-        intrinsics,
-        tuple(notes),
-        least_confidence=_LEAST_CONFIDENCE,
-        z_up=True,
-        poses_drift=True,
-        read=("info.json", *(path.name for path in tables.values())),
-        upright_tags=False,
-    )
+    ]
+    cameras = [stated[p][0] if p in stated else None for p in colors]
+    layout = scan_layout("scannerapp", files, cameras, root, options, "cameras and poses of 3D Scanner App (ARKit)")
+    return replace(layout, poses_drift=True, read=("info.json", *(path.name for path in tables.values())))
 
 
 def _table(path: Path) -> tuple[list[float], Any, float | None]:

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from list3r.frames.layout import read_camera_matrix, read_lines, read_numbers
 from list3r.frames.options import Intrinsics, SourceOptions
+from list3r.frames.readers.phones.scan import LEAST_CONFIDENCE
 from list3r.frames.readers.video_depth import RecordingParts, VideoWithDepth
 from list3r.frames.recordings.axes import Z_UP_FROM_Y_UP, pose_of_quaternion
 from list3r.memory.core.errors import SourceError
 
-LEAST_CONFIDENCE = 1
-"""Depth of confidence 0 is unknown (stored 0, 1, 2)."""
 _MILLIMETRES = 1000.0
 
 
