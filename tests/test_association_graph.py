@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from list3r.association.graph.edge_information import WeightSettings, information_of
 from list3r.association.graph.pose_graph import contradicted, optimize
 from list3r.memory.core.geometry import Sim3
 from list3r.memory.core.records import Edge
@@ -136,3 +137,13 @@ def test_a_thousand_chunks() -> None:
     loops = [edge(truth, k, (k + 400) % 1000, "loop") for k in range(0, 600, 3)]
     result = optimize(range(1000), [edge(truth, k, k + 1, "adjacent") for k in range(999)] + loops, {}, metric=True)
     assert errors(result.S_graph_chunk, truth).max() < 1e-3
+
+
+def test_edges_of_known_scale_hold_it_beside_edges_of_computed_depth() -> None:
+    truth = circle(2)
+    known = np.diag([1e-4, 2e-4, 1e-4, 1e-4, 1e-4, 2e-4, 0.0])
+    free = known + np.diag([0, 0, 0, 0, 0, 0, 1e-4])
+    edges = [replace(edge(truth, 0, 1, "loop"), covariance=c) for c in (known, free)]
+    stiff = replace(WeightSettings(), bending=0.0)
+    sure, unsure = information_of(edges, False, stiff)[:, 6, 6]
+    assert np.isfinite(sure) and sure > 1e3 * unsure

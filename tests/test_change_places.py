@@ -161,6 +161,28 @@ def test_what_is_removed_was_looked_for_as_a_whole_and_often(
         assert [i.state for i in gone] == (told or ["unseen"])
 
 
+@pytest.mark.parametrize(
+    ("kind", "there", "told"),
+    [("metric", True, ["removed"]), ("relative", True, []), ("relative", False, ["removed"])],
+)
+def test_computed_depth_that_is_a_little_off_does_not_see_through_things(
+    tmp_path: Path, kind: str, there: bool, told: list[str]
+) -> None:
+    """A second session of which depth is 4 % too large does not find the stool, whether it stands there or not."""
+    with Store.create(tmp_path / "a.l3r") as store, store.transaction():
+        path = np.concatenate([cameras(ROOM["stool"].center, 0.8)] * 2)
+        add_session(store, dict(ROOM), path)
+        seen, found = (
+            simulated_chunk(room, path) for room in (ROOM if there else _without("stool"), _without("stool"))
+        )
+        far = tuple(replace(k, depth_small=1.04 * k.depth_small) for k in seen.keyframes)
+        session = store.sessions.add("simulated", "1", {}, len(path))
+        store.chunks.add(session, replace(found, keyframes=far, scale_kind=kind))
+        place_together(store)
+        consolidate(store)
+        assert [e.kind for e in store.events.all(2) if e.kind != "seen_again"] == told
+
+
 def _without(name: str) -> dict[str, Box]:
     return {k: b for k, b in ROOM.items() if k != name}
 

@@ -68,7 +68,7 @@ class Panel:
     def found(self, asked: str, ids: list[int], notes: str) -> None:
         """List the answers of a search, in place of the last ones, or say that there are none."""
         self._answers = (asked, ids)
-        self.say(notes if ids else f"Nothing found for \u201c{plain(asked)}\u201d. {notes}".strip())
+        self.say(notes if ids else f"Nothing found for \u201c{plain(asked)}\u201d: {notes}".removesuffix(": "))
         self.list()
 
     def list(self) -> None:

@@ -41,6 +41,10 @@ class WeightSettings:
     """Standard deviation of an edge without a covariance at confidence 1, as for `bending`."""
 
 
+_LEAST_SCALE = 1e-4
+"""Standard deviation of scale between two chunks whose depth a sensor measured, which state none."""
+
+
 def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings) -> Array:
     """Return the inverse covariances of the edges' tangent errors with deformation, in u's units.
 
@@ -60,6 +64,8 @@ def information_of(edges: Sequence[Edge], metric: bool, settings: WeightSettings
         )
     for k in np.flatnonzero(~measured).tolist():
         covariance[k] = _unmeasured(edges[k], metric, settings)
+    if not metric:  # chunks with a sensor's depth beside others
+        covariance[:, 6, 6] = np.maximum(covariance[:, 6, 6], _LEAST_SCALE**2)
     inverse = np.linalg.inv(covariance[:, :size, :size])
     return np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -30,6 +30,7 @@ from list3r.memory.library.overlap.visibility import (
     Ints,
     OtherSurface,
     PlaceVisibility,
+    VisibilitySettings,
     changed_points,
     chunk_views,
     in_sight_of,
@@ -76,6 +77,8 @@ class Places:
         self._upright = store.facts.gravity != "unknown"
         self._first = min(c.component for c in chunks)
         self._store, self._s = store, settings
+        self._computed = min((c.session_id for c in chunks if c.scale_kind != "metric"), default=None)
+        self._coarse = replace(settings.visibility, noise_share=settings.computed_noise)
         self._views_of, self._sights = cache(self._read_views), cache(self._read_sights)
         self.light, self.extent, self.frames_in = cache(self._light_in), cache(self._box_round), cache(self._frames_in)
         self._member_changed, self._summed_up = cache(self._changed_of_member), cache(self._sum_up)
@@ -84,6 +87,10 @@ class Places:
         self._picture = lru_cache(_PICTURES)(self._read_picture)
         self.sessions = [sorted({self.rows[k].session_id for k, _ in g}) for g in groups]
         self.component = [self.rows[g[0][0]].component for g in groups]
+
+    def _visibility(self, session: int) -> VisibilitySettings:
+        """Return how exactly depth of a session and those before tells about places."""
+        return self._s.visibility if self._computed is None or session < self._computed else self._coarse
 
     def members(self, n: int, session: int, *, before: bool, stayed: bool = False) -> list[Key]:
         """Return members of the last session before, or of this one; those that tell of the change, if it has not
@@ -198,15 +205,16 @@ class Places:
         the uncertainty of the session's pose allows that the instance is there.
         """
         (points, rgb), s = self._thinned(n, session, before=before), self._s
-        found, other = place_visibility(points, views, s.visibility), None
+        visibility = self._visibility(session)
+        found, other = place_visibility(points, views, visibility), None
         if found.verdict in ("there", "unclear"):
             other = self._other_colors(rgb, session, before=before)
-            by_color = found if other is None else place_visibility(points, views, s.visibility, other)
+            by_color = found if other is None else place_visibility(points, views, visibility, other)
             found = by_color if by_color.verdict == "gone" else found
         if found.verdict == "gone":
-            known = s.visibility.tolerance_m * self.unit
+            known = visibility.tolerance_m * self.unit
             for shift in self.ties.shifts(session, points.mean(axis=0), s.placed_deviations, known):
-                if place_visibility(points + shift, views, s.visibility, other).verdict != "gone":
+                if place_visibility(points + shift, views, visibility, other).verdict != "gone":
                     return PlaceVisibility("unseen", 0.0, ())
         return found
 
@@ -242,7 +250,7 @@ class Places:
     def explained(self, n: int, new: Sequence[int], session: int) -> float:
         """Return the share of the observed surface of an instance that is seen through or near a new instance there."""
         points = self.points(n, session, before=True)
-        free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
+        free, met = tally(points, self._views_of(session, self.component[n]), self._visibility(session))
         known, near = free + met > 0, self._at_new(points, new, session)
         return float(np.mean((near | (free > met))[known])) if known.any() else 0.0
 
@@ -251,7 +259,7 @@ class Places:
         instance that has its place: the rest may still be there.
         """
         points = self.points(n, session, before=True, stayed=True)
-        free, met = tally(points, self._views_of(session, self.component[n]), self._s.visibility)
+        free, met = tally(points, self._views_of(session, self.component[n]), self._visibility(session))
         near = self._at_new(points, [] if other is None else [other], session)
         return float(np.mean(near | (free + met > 0))) if len(points) else 0.0
 
@@ -264,7 +272,7 @@ class Places:
 
     def _changed(self, points: Array, n: int, session: int, *, before: bool) -> float:
         lists = [self._views_of(session, self.component[n])] if before else self._views_before(n, session)
-        shares = (seen_through_shares([points], views, self._s.visibility)[0] for views in lists)
+        shares = (seen_through_shares([points], views, self._visibility(session))[0] for views in lists)
         return next((share for share in shares if share is not None), 0.0)
 
     def _views_before(self, n: int, session: int) -> Iterator[list[DepthView]]:

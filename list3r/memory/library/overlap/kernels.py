@@ -15,14 +15,14 @@ def tell(
     unit: float,
     depth: NDArray[np.float32],
     camera: tuple[float, float, float, float],
-    slack: tuple[float, float],
+    slack: tuple[float, float, float],
     reach: tuple[float, float],
 ) -> NDArray[np.int8]:
     """Return what a depth image tells about points in the frame of its camera. Shape (N, 3) -> (N,).
 
     `depth` (h, w) and points are in units of which `unit` are a metre, `camera` is fx, fy, cx, cy. A surface may lie
-    off by `slack`: metres, and metres for the square of one of depth; `reach` are the nearest and the farthest depth
-    that tell. A pixel speaks together with its eight neighbours.
+    off by `slack`: metres, metres for the square of one of depth, and a share of depth; `reach` are the nearest and the
+    farthest depth that tell. A pixel speaks together with its eight neighbours.
     """
     out = np.zeros(len(p), np.int8)
     fx, fy, cx, cy = camera
@@ -33,7 +33,9 @@ def tell(
             continue
         column, row = np.rint(p[n, 0] / p[n, 2] * fx + cx), np.rint(p[n, 1] / p[n, 2] * fy + cy)
         if 1 <= column < width - 1 and 1 <= row < height - 1:
-            out[n] = _verdict(depth, int(row), int(column), np.float32(unit), z, slack[0] + slack[1] * z**2)
+            out[n] = _verdict(
+                depth, int(row), int(column), np.float32(unit), z, slack[0] + slack[1] * z**2 + slack[2] * z
+            )
     return out
 
 

@@ -27,6 +27,8 @@ class VisibilitySettings:
     """How far a surface may lie from where it is stored: alignment of two sessions."""
     noise_per_m2: float = 0.0045
     """Three deviations of depth at one metre; grows with the square of depth (structured light, 3 x 1.5 mm)."""
+    noise_share: float = 0.0
+    """How far it may be off besides as a share of depth, where it is computed."""
     nearest_m: float = 0.3
     """Closer than this nothing is measured."""
     most_depth_m: float = 4.5
@@ -135,7 +137,7 @@ def point_visibility(points: Array, view: DepthView, s: VisibilitySettings) -> N
     """
     from list3r.memory.library.overlap.kernels import tell  # questions to a memory do without numba
 
-    slack, reach = (s.tolerance_m, s.noise_per_m2), (s.nearest_m, s.most_depth_m)
+    slack, reach = (s.tolerance_m, s.noise_per_m2, s.noise_share), (s.nearest_m, s.most_depth_m)
     p = np.ascontiguousarray(view.S_cam_world.apply(points))
     return tell(p, float(view.unit), np.ascontiguousarray(view.depth), view.camera, slack, reach)
 
