@@ -1,9 +1,10 @@
-"""The viewer on millions of points: frames while the camera is turned, search, a click, errors of the page.
+"""The viewer on millions of points or a memory: frames while the camera is turned, search, a click, errors of the page.
 
 PYTHONPATH=. python benchmarks/viewer.py --points 5000000 --json FILE --picture FILE
+PYTHONPATH=. python benchmarks/viewer.py --memory house.l3r
 
-The memory is synthetic (`exporters.py`). The page is Chromium without a screen and without a graphics card: its
-software renderer draws, so a frame is also given in processor seconds of all its processes.
+The memory is synthetic (`exporters.py`) unless one is given. The page is Chromium without a screen and without a
+graphics card: its software renderer draws, so a frame is also given in processor seconds of all its processes.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=5_000_000)
     parser.add_argument("--objects", type=int, default=2_000)
+    parser.add_argument("--memory", type=Path, help="a memory to show, instead of one with so many points")
+    parser.add_argument("--words", default="Stuhl", help="what is searched")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     parser.add_argument("--picture", type=Path, help="file for a picture of the page")
     args = parser.parse_args()
@@ -49,17 +52,21 @@ def main() -> None:
 
     exporters.POINTS = args.points // args.objects
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "made.l3r"
-        exporters.write_memory(path, args.objects)
-        report = {"points": args.points, "instances": args.objects, "file_mb": round(path.stat().st_size / 1e6, 1)}
+        path = args.memory or Path(folder) / "made.l3r"
+        if args.memory is None:
+            exporters.write_memory(path, args.objects)
+        report: dict[str, Any] = {"file_mb": round(path.stat().st_size / 1e6, 1)}
         with list3r.open(path) as memory:
             began = time.process_time()
             viewer = Viewer(memory, ViewerSettings(0))
             report["start_cpu_s"] = round(time.process_time() - began, 1)
+            sheets = viewer.world.sheets.values()
+            report |= {"instances": len(viewer.world.instances), "points": int(viewer.world.cloud.counts.sum())}
+            report |= {"triangles": sum(len(s.faces) for s in sheets)}
             report["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
             page = Browser(Path(folder) / "profile")
             try:
-                report |= measure(page, viewer, args.picture)
+                report |= measure(page, viewer, args)
             finally:
                 page.close()
                 viewer.stop()
@@ -67,7 +74,7 @@ def main() -> None:
     write_json(args.json, report)
 
 
-def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, Any]:
+def measure(page: Browser, viewer: Viewer, args: argparse.Namespace) -> dict[str, Any]:
     """Time of the page to load, to turn and to search."""
     began = time.monotonic()
     page.open(viewer.address)
@@ -78,18 +85,19 @@ def measure(page: Browser, viewer: Viewer, picture: Path | None) -> dict[str, An
     (points,) = viewer._pages.values()
     report = {"load_s": round(loaded, 1), "shown_s": round(time.monotonic() - began, 1)}
     report |= {"page_draws_points_a_s": round(1 / (points.seconds_a_point or 1e-9)), "at_rest": drawn(points, "/fine/")}
+    report |= {"all_triangles_ms": round(1000 * points.seconds_of_sheets), "slow": points.slow}
     page.run(f"window.drawn = []; {COUNT_FRAMES}")
     report |= {"moving": drawn(points, "/coarse/"), **turn(page)}
     print(report, flush=True)
     time.sleep(5.0)
     began = time.monotonic()
-    page.fill("Find", "Stuhl")
+    page.fill("Find", args.words)
     page.press("Search")
     page.wait(lambda: viewer.state.selected is not None, 300)
     report["search_s"] = round(time.monotonic() - began, 2)
     time.sleep(5.0)
-    if picture is not None:
-        Image.fromarray(page.picture()).save(picture)
+    if args.picture is not None:
+        Image.fromarray(page.picture()).save(args.picture)
     return {**report, "console_errors": page.errors}
 
 

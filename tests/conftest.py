@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,6 +32,10 @@ from list3r.memory.store.store import Store
 THOROUGH = os.environ.get("LIST3R_TEST_PROFILE") == "thorough"
 settings.register_profile("suite", max_examples=300 if THOROUGH else 40, deadline=None)
 settings.load_profile("suite")
+
+# What is made of memories here is nobody's: it goes when the tests end.
+_CACHE = tempfile.TemporaryDirectory()
+os.environ.setdefault("LIST3R_CACHE", _CACHE.name)
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
