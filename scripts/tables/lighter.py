@@ -73,6 +73,6 @@ def traces() -> str:
         counts = [", ".join(f"{of[k]:,}" for of in both) for k in ("files", "functions", "calls")]
         rows.append([words, *counts, ", ".join(f"{100 * of['share_that_checks_integrity']:.0f} %" for of in both)])
     spent = [f"{before['processor_ms'][k]:.1f}, {now['processor_ms'][k]:.1f} ms" for k in now["processor_ms"]]
-    rows = [row + ["" if row[0] != "open + `find`" else spent[0]] for row in rows]
+    rows = [[*row, "" if row[0] != "open + `find`" else spent[0]] for row in rows]
     rows.insert(2, ["open + `nearest`", "", "", "", "", spent[1]])
     return table(["before, now", "files", "functions", "calls", "of all calls check integrity", "processor time"], rows)
