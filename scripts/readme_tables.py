@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from tables.association import alignment, changed, fair, kitchen, methods, registration, returns, worth
 from tables.exports import batches, catalogue, exports, pack, physics, receivers
-from tables.lighter import derivation
+from tables.lighter import derivation, questions, traces
 from tables.results import ROOT
 from tables.summary import summary
 from tables.things import changes, discovery, memories, relations, walks
@@ -34,6 +34,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "changed": changed,
     "alignment": alignment,
     "derivation": derivation,
+    "questions": questions,
+    "traces": traces,
     "changes": changes,
     "relations": relations,
     "pack": pack,

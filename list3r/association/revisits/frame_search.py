@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.frames.sift import SIFT_WIDTH, root_sift
 from list3r.memory.core.records import ChunkRow
 from list3r.memory.store.store import Store
-from list3r.reconstruction.features.local import SIFT_WIDTH
-from list3r.reconstruction.features.vlad import Vocabulary, root_sift
+from list3r.reconstruction.features.vlad import Vocabulary
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
