@@ -88,6 +88,7 @@ TEXTS = [
     "red blue",
     "small mug",
     "large red box near chair",
+    "red box near blue table",
 ]
 
 

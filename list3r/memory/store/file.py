@@ -70,7 +70,7 @@ def explained(path: Path, error: Exception) -> str:
         return f"{path}: what was to be written is none of its table ({text}); nothing was changed"
     if "not a database" in text:
         return f"{path} is not a memory file; make one with `list3r build SOURCE -m MEMORY`"
-    if "full" in text or "disk I/O" in text:
+    if isinstance(error, apsw.FullError | apsw.IOError):
         return (
             f"{path} could not be written, the disk is full or failing ({text}); free some space and run the command "
             "again, a build or an update with --resume"

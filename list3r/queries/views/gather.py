@@ -24,7 +24,7 @@ from list3r.queries.finding.grammar import Clause, Phrase
 from list3r.queries.finding.naming import tiers
 from list3r.queries.match import checked_instance
 
-EVERYTHING = 5_000
+EVERYTHING = 500
 """Up to this many instances all are loaded."""
 _MOST_BEARING = 300_000
 """Ids that have the words of one phrase, at most."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 from list3r.memory.core.description.nouns import nouns_of
@@ -44,4 +45,4 @@ def _kinds(label: str | None, structure: str | None, described: str) -> dict[str
 
 def kind_word(noun: str) -> str:
     """Return the word under which an index keeps all that is called a noun, by whatever name: "_office_chair"."""
-    return "_" + noun.replace(" ", "_")
+    return "_" + re.sub(r"\W+", "_", noun)
