@@ -41,9 +41,9 @@ class Store:
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
-        self.derived = Derived()
-        """What is made of the memory and kept until it is closed."""
 
+    derived = cached_property(lambda _: Derived())
+    """What is made of the memory and kept until it is closed."""
     facts = cached_property(lambda s: Facts(s.connection))
     sessions = cached_property(lambda s: Sessions(s.connection))
     frames = cached_property(lambda s: Frames(s.connection))
