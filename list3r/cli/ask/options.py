@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Unpack
 
 import typer
 
@@ -51,9 +51,9 @@ class Filtering:
     min_confidence: float | None = option(None, MIN_CONFIDENCE)
     structure: bool = option(False, "Also floor, walls, ceiling.")
 
-    def filters(self) -> FilterOptions:
-        """Return the filters as the questions of Python take them."""
-        return {**vars(self), "min_confidence": self.min_confidence or 0.0}  # type: ignore[typeddict-item]
+    def filters(self, **more: Unpack[FilterOptions]) -> FilterOptions:
+        """Return these filters and more as the questions of Python take them."""
+        return {**vars(self), "min_confidence": self.min_confidence or 0.0, **more}  # type: ignore[typeddict-item]
 
 
 @dataclass(frozen=True)

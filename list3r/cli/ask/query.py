@@ -96,10 +96,7 @@ def nearest(
             k=k,
             max_distance=max_distance,
             encoder=None if words is None else scene.word_encoder(),
-            state=state,
-            component=component,
-            room=room,
-            **look.filters(),
+            **look.filters(state=state, component=component, room=room),
         )
         print_matches(matches, scene.lengths, json)
 
