@@ -148,7 +148,10 @@ CASES = {
     "ids in no folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/absent", "absent is not a folder"),
     "ids without masks": ("instances {p}/truth/truth.json {p}/room.json --ids {p}/folder", "no masks"),
     "ids in an empty folder": ("instances {p}/truth/truth.json {p}/room.l3r --ids {p}/folder", "no pictures of true"),
-    "ids of every zeroth frame": ("instances {p}/truth/truth.json {p}/room.l3r --every 0", "--every.*greater than or equal to 1"),
+    "ids of every zeroth frame": (
+        "instances {p}/truth/truth.json {p}/room.l3r --every 0",
+        "--every.*greater than or equal to 1",
+    ),
     "instances of another time": ("instances {p}/truth/truth.json {p}/room.l3r --align {p}/late.txt", "0 poses within"),
     "revisits of nothing": ("revisits {p}/absent.npz {p}/walk.l3r", "absent.npz"),
     "revisits of another array": ("revisits {p}/zeros.npz {p}/walk.l3r", "zeros.npz has no array frame"),
