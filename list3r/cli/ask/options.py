@@ -52,7 +52,7 @@ class Filtering:
     structure: bool = option(False, "Also floor, walls, ceiling.")
 
     def filters(self, **more: Unpack[FilterOptions]) -> FilterOptions:
-        """Return the filters, and more of them, as the questions of Python take them."""
+        """Return these filters and more as the questions of Python take them."""
         return {**vars(self), "min_confidence": self.min_confidence or 0.0, **more}  # type: ignore[typeddict-item]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -40,35 +41,36 @@ class Store:
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
-        self.derived = Derived()
-        """What is made of the memory and kept until it is closed."""
-        self.facts = Facts(connection)
-        self.sessions = Sessions(connection)
-        self.frames = Frames(connection)
-        self.keyframes = Keyframes(connection)
-        self.supports = Supports(connection)
-        self.local_instances = LocalInstances(connection, self.supports)
-        self.chunks = Chunks(connection, self.frames, self.keyframes, self.local_instances)
-        self.edges = Edges(connection)
-        self.bends = Bends(connection)
-        self.votes = LabelVotes(connection)
-        self.trajectory = PlacedTrajectory(self.chunks, self.frames, self.bends)
-        self.pair_scores = PairScoreTable(connection)
-        self.merges = MergeLog(connection)
-        self.edits = Edits(connection)
-        self.ids = Ids(connection, self.facts)
-        self.embeddings = Embeddings(connection)
-        self.relations = RelationTable(connection, self.ids)
-        self.events = Events(connection)
-        self.rooms = RoomTable(connection)
-        self.detected_labels = DetectedLabels(connection)
-        self.words = Words(connection)
-        self.instances = Instances(connection, self.ids, self.words)
-        self.observations = Observations(connection, self.ids)
-        self.surfaces = Surfaces(self.chunks, self.supports, self.instances, self.events)
-        self.tracks = PlacedTracks(
-            (self.chunks, self.frames), (self.local_instances, self.supports), (self.instances, self.observations)
-        )
+
+    derived = cached_property(lambda _: Derived())
+    """What is made of the memory and kept until it is closed."""
+    facts = cached_property(lambda s: Facts(s.connection))
+    sessions = cached_property(lambda s: Sessions(s.connection))
+    frames = cached_property(lambda s: Frames(s.connection))
+    keyframes = cached_property(lambda s: Keyframes(s.connection))
+    supports = cached_property(lambda s: Supports(s.connection))
+    local_instances = cached_property(lambda s: LocalInstances(s.connection, s.supports))
+    chunks = cached_property(lambda s: Chunks(s.connection, s.frames, s.keyframes, s.local_instances))
+    edges = cached_property(lambda s: Edges(s.connection))
+    bends = cached_property(lambda s: Bends(s.connection))
+    votes = cached_property(lambda s: LabelVotes(s.connection))
+    trajectory = cached_property(lambda s: PlacedTrajectory(s.chunks, s.frames, s.bends))
+    pair_scores = cached_property(lambda s: PairScoreTable(s.connection))
+    merges = cached_property(lambda s: MergeLog(s.connection))
+    edits = cached_property(lambda s: Edits(s.connection))
+    ids = cached_property(lambda s: Ids(s.connection, s.facts))
+    embeddings = cached_property(lambda s: Embeddings(s.connection))
+    relations = cached_property(lambda s: RelationTable(s.connection, s.ids))
+    events = cached_property(lambda s: Events(s.connection))
+    rooms = cached_property(lambda s: RoomTable(s.connection))
+    detected_labels = cached_property(lambda s: DetectedLabels(s.connection))
+    words = cached_property(lambda s: Words(s.connection))
+    instances = cached_property(lambda s: Instances(s.connection, s.ids, s.words))
+    observations = cached_property(lambda s: Observations(s.connection, s.ids))
+    surfaces = cached_property(lambda s: Surfaces(s.chunks, s.supports, s.instances, s.events))
+    tracks = cached_property(
+        lambda s: PlacedTracks((s.chunks, s.frames), (s.local_instances, s.supports), (s.instances, s.observations))
+    )
 
     @classmethod
     def create(cls, path: str | Path) -> Self:
