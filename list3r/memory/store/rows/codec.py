@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import zipfile
 import zlib
 from collections.abc import Mapping
 from typing import Any
@@ -46,12 +44,9 @@ def pack(arrays: Mapping[str, ArrayLike]) -> bytes:
 def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
     """Named arrays of `pack`. `where` names the row in the `MemoryFileError` raised for damaged bytes.
 
-    Only numbers and booleans are read, and an array takes no more memory than the bytes that are really there. Memories
-    of before are read too, whose arrays are an `.npz`.
+    Only numbers and booleans are read, and an array takes no more memory than the bytes that are really there.
     """
     try:
-        if blob[:2] == b"PK":
-            return _unzipped(blob)
         stream = zlib.decompressobj()
         data = stream.decompress(blob, MAX_BLOB_BYTES)
         if not stream.eof:
@@ -66,30 +61,8 @@ def unpack(blob: bytes, where: str) -> dict[str, NDArray[Any]]:
         if at != len(data):
             raise ValueError(f"{len(data)} bytes instead of {at}")
         return out
-    except (ValueError, TypeError, SyntaxError, OverflowError, zlib.error, *_OF_ZIP) as error:
+    except (ValueError, TypeError, SyntaxError, OverflowError, zlib.error) as error:
         raise MemoryFileError(f"{where} cannot be read ({error}); run `list3r verify` on the file") from error
-
-
-_OF_ZIP = (zipfile.BadZipFile, KeyError, EOFError, OSError, NotImplementedError, RuntimeError, MemoryError)
-"""What a damaged zip raises besides."""
-
-
-def _unzipped(blob: bytes) -> dict[str, NDArray[Any]]:
-    with zipfile.ZipFile(io.BytesIO(blob)) as held:
-        if sum(part.file_size for part in held.infolist()) > MAX_BLOB_BYTES:
-            raise ValueError(f"more than {MAX_BLOB_BYTES >> 20} MiB")
-        return {part.removesuffix(".npy"): _array(held.read(part)) for part in held.namelist()}
-
-
-def _array(data: bytes) -> NDArray[Any]:
-    """One array of an `.npz`; its header may claim no more than there is."""
-    file = io.BytesIO(data)
-    version = np.lib.format.read_magic(file)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    rest = data[file.tell() :]
-    if version != (1, 0) or fortran or dtype.kind not in "biuf" or len(rest) != math.prod(shape) * dtype.itemsize:
-        raise ValueError(f"an array of {dtype} and shape {shape} in {len(rest)} bytes")
-    return np.frombuffer(bytearray(rest), dtype).reshape(shape)
 
 
 def pack_sim3(transform: Sim3) -> bytes:
