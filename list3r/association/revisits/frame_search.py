@@ -2,7 +2,7 @@
 
 Frames with SIFT features are found by these: the nearest stored features of each one vote for their frames, the more
 the nearer they are against those that follow. Others are found by exact search over one descriptor of each frame
-(research/association 0047).
+(research/association: places, 0047).
 """
 
 from __future__ import annotations
@@ -92,8 +92,9 @@ class Candidate:
     frame_v: int
     """Frame.index in the new chunk."""
     cosine: float
+    """Of two descriptors; of features the votes, as a share."""
     s_det: float
-    """The cosine on the scale of trained place recognition."""
+    """The same on the scale of trained place recognition."""
 
 
 class FeatureIndex:
@@ -234,8 +235,7 @@ def choose(
     settings: SearchSettings,
     other_sessions: Collection[int] = (),
 ) -> list[Candidate]:
-    """Return the similar frames of pairs of chunks, thinned out in time, with a quota for each pair of
-    chunks.
+    """Return the similar frames of pairs of chunks, thinned out in time, with a quota for each pair of chunks.
 
     `frame_v` (P,) is Frame.index in the new chunk, `stored` (P, 2) chunk id and Frame.index, `cosine` (P,).
     `other_sessions` are the chunks of other sessions than the new one's.
