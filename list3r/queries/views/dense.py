@@ -41,11 +41,12 @@ def surfaces(store: Store) -> dict[int, Surface]:
     """Return the surface of each present instance, by id, and under `REST` what is of no instance in the main
     component; world coordinates.
     """
-    frames: dict[int, int] = {}
+    frames = dict.fromkeys([i.component for i in store.instances.all()], 0)
     for c in store.chunks.all():
         frames[c.component] = frames.get(c.component, 0) + c.last_frame - c.first_frame
     out: dict[int, Surface] = {}
     for component in sorted(frames, key=lambda k: (frames[k], -k)):
+        out.pop(REST, None)
         out |= component_surfaces(store, component)
     return dict(sorted(out.items()))
 

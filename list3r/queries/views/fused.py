@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.store.store import Store
 from list3r.queries.relations import unit_of
-from list3r.queries.views.depth_frames import DepthFrame, depth_frames
+from list3r.queries.views.depth_frames import REST, DepthFrame, depth_frames
 
 Ints = NDArray[np.int64]
 
@@ -204,6 +204,8 @@ class _Votes:
         from scipy.spatial import cKDTree
 
         key, owner = _commonest(*self._sum())
+        if not len(key):
+            return np.full(len(vertices), REST, np.int64)
         cells = np.stack([key >> 42, (key >> 21) & (2 * _CELLS - 1), key & (2 * _CELLS - 1)], axis=1) - _CELLS
         return np.asarray(owner[cKDTree((cells + 0.5) * self._cell).query(vertices)[1]])
 
