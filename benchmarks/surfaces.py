@@ -154,7 +154,7 @@ def true_points(settings: WalkSettings) -> Array:
 
 
 def scores(surface: Surface, world: SimulatedWorld, truth: Array) -> dict[str, float]:
-    on, _ = surface.sampled(SAMPLES, np.random.default_rng(0))
+    on, _, _ = surface.sampled(SAMPLES)
     scene = open3d.t.geometry.RaycastingScene()
     tensor = open3d.core.Tensor
     scene.add_triangles(tensor(surface.vertices), tensor(surface.faces.astype(np.uint32)))

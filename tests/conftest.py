@@ -75,9 +75,11 @@ def local_instance(local_id: int, points: np.ndarray, rgb: tuple[int, int, int],
 
 
 def chunk_result(
-    index: int, first: int, count: int, instances: tuple[LocalInstance, ...], jpeg: bytes = b""
+    index: int, first: int, count: int, instances: tuple[LocalInstance, ...], jpeg: bytes = b"", depth: float = 1.0
 ) -> ChunkResult:
-    """A chunk whose camera stands at the origin looking along +x of a z-up world, moving 1 cm a frame along y."""
+    """A chunk whose camera stands at the origin looking along +x of a z-up world, moving 1 cm a frame along y; its
+    keyframe sees a wall at a depth, or nothing at 0.
+    """
     T_chunk_cam = np.tile(np.eye(4), (count, 1, 1))
     T_chunk_cam[:, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T_chunk_cam[:, 1, 3] = 0.01 * np.arange(count)
@@ -89,7 +91,7 @@ def chunk_result(
         keypoints_xy=np.zeros((4, 2), np.float32),
         keypoint_descriptors=np.zeros((4, 32), np.uint8),
         points_cam=np.ones((4, 3), np.float32),
-        depth_small=np.ones((6, 8), np.float32),
+        depth_small=np.full((6, 8), depth, np.float32),
         camera_small=(8.0, 8.0, 4.0, 3.0),
         jpeg=jpeg,
     )
@@ -180,14 +182,18 @@ def small_picture() -> bytes:
     return out.getvalue()
 
 
-def write_small_room(store: Store, jpeg: bytes = b"", *, frames: int = 20, points: int = 400) -> None:
-    """Fill an empty store with `SMALL_ROOM`, seen in one chunk of so many frames; the first may have a picture."""
+def write_small_room(
+    store: Store, jpeg: bytes = b"", *, frames: int = 20, points: int = 400, depth: float = 1.0
+) -> None:
+    """Fill an empty store with `SMALL_ROOM`, seen in one chunk of so many frames; the first may have a picture, and
+    sees a wall before all else, or nothing at a depth of 0.
+    """
     local = tuple(
         local_instance(k, box_points(center, size, points, k), rgb, np.arange(frames))
         for k, (_, center, size, rgb, _) in enumerate(SMALL_ROOM)
     )
     session = store.sessions.add("walk", "abc", {"length": 100}, frames)
-    chunk = store.chunks.add(session, chunk_result(0, 0, frames, local, jpeg))
+    chunk = store.chunks.add(session, chunk_result(0, 0, frames, local, jpeg, depth))
     store.chunks.place({chunk: Sim3.identity()}, {chunk: chunk})
     store.facts.scale_kind, store.facts.scale_source = "metric", "sensor depth"
     store.facts.gravity = "estimated"

@@ -39,7 +39,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small room with a picture, and a mug of a name that would like to be markup."""
     path = tmp_path_factory.mktemp("receivers") / "room.l3r"
     with Store.create(path) as store, store.transaction():
-        write_small_room(store, small_picture())
+        write_small_room(store, small_picture(), depth=0.0)
         store.instances.set_labels({MUG: NASTY})
     return path
 

@@ -58,7 +58,7 @@ FLOOR, TABLE, MUG, TWIN, CHAIR, WALL = range(1, 7)
 
 def write_room(path: Path) -> Path:
     with Store.create(path) as store, store.transaction():
-        write_small_room(store, small_picture())
+        write_small_room(store, small_picture(), depth=0.0)
     return path
 
 
@@ -112,7 +112,14 @@ def test_the_overview_keeps_its_bound_and_small_things(counts: list[int], most: 
 def test_a_part_of_a_cloud_has_the_points_asked_for(ranges: list[tuple[int, int]]) -> None:
     counts = np.full(len(ranges), 9)
     points = np.arange(27 * len(ranges), dtype=np.float32).reshape(-1, 3)
-    cloud = ShownCloud(points, points.astype(np.uint8), 5 + np.arange(len(ranges)), counts, np.ones(len(ranges)))
+    cloud = ShownCloud(
+        points,
+        points.astype(np.uint8),
+        points.astype(np.int8),
+        5 + np.arange(len(ranges)),
+        counts,
+        np.ones(len(ranges)),
+    )
     low, high = np.array(ranges).T
     part = cloud.part(low, high)
     wanted = [points[9 * k + a : 9 * k + b] for k, (a, b) in enumerate(ranges)]

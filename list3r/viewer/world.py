@@ -28,13 +28,15 @@ _RAY_RADIUS = 0.008
 @dataclass(frozen=True)
 class ShownCloud:
     """Points on the surfaces of many instances, concatenated; each in random order, so that any prefix is a coarser
-    cloud. 15 bytes a point, so that tens of millions fit. Id 0 stands for what belongs to no instance.
+    cloud. 18 bytes a point, so that tens of millions fit. Id 0 stands for what belongs to no instance.
     """
 
     points: NDArray[np.float32]
     """World. Shape (N, 3)."""
     rgb: NDArray[np.uint8]
     """Shape (N, 3)."""
+    normals: NDArray[np.int8]
+    """Where triangles look, which are not seen from behind, at a length of 127; 0 of points. Shape (N, 3)."""
     ids: NDArray[np.int64]
     """Ids of the instances. Shape (K,)."""
     counts: NDArray[np.int64]
@@ -53,7 +55,8 @@ class ShownCloud:
         first = np.cumsum(self.counts) - self.counts + low
         place = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
         wider = np.sqrt(self.counts / np.maximum(counts, 1))
-        return ShownCloud(self.points[place], self.rgb[place], self.ids, counts, self.spacing * wider)
+        chosen = self.points[place], self.rgb[place], self.normals[place]
+        return ShownCloud(*chosen, self.ids, counts, self.spacing * wider)
 
     def of(self, instance_id: int, most: int) -> ShownCloud:
         """Return the first points of one instance."""
@@ -120,20 +123,16 @@ def read_world(memory: SceneMemory, changes: list[Changed]) -> ShownWorld:
 
 
 def _cloud(surfaces: dict[int, Surface]) -> ShownCloud:
-    points, rgb, spacing = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)], []
+    parts = [(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.float32))]
     for n, surface in surfaces.items():
-        rng = np.random.default_rng(n)
-        if len(surface.faces):
-            on, ink = surface.sampled(_POINTS_A_FACE * len(surface.faces), rng)
-        else:
-            order = rng.permutation(len(surface.vertices))
-            on, ink = surface.vertices[order], surface.rgb[order]
-        points.append(on)
-        rgb.append(ink)
-        spacing.append(point_spacing(on) if len(on) else 0.0)
-    counts = np.array([len(p) for p in points[1:]], np.int64)
+        order = np.random.default_rng(n).permutation(len(surface.vertices))
+        bare = surface.vertices[order], surface.rgb[order], np.zeros((len(order), 3), np.float32)
+        parts.append(surface.sampled(_POINTS_A_FACE * len(surface.faces)) if len(surface.faces) else bare)
+    points, rgb, normals = (np.concatenate(each) for each in zip(*parts, strict=True))
+    counts = np.array([len(p) for p, _, _ in parts[1:]], np.int64)
+    spacing = np.array([point_spacing(p) if len(p) else 0.0 for p, _, _ in parts[1:]])
     return ShownCloud(
-        np.concatenate(points), np.concatenate(rgb), np.array(list(surfaces), np.int64), counts, np.array(spacing)
+        points, rgb, np.round(127 * normals).astype(np.int8), np.array(list(surfaces), np.int64), counts, spacing
     )
 
 
@@ -206,9 +205,9 @@ def colors(world: ShownWorld, cloud: ShownCloud, mode: str, selected: int | None
 
 def sheet_colors(world: ShownWorld, instance_id: int, mode: str) -> NDArray[np.uint8]:
     """Return the colours of the triangles' corners of an instance. Shape (V, 3)."""
-    rgb = world.sheets[instance_id].rgb
-    only = np.array([instance_id]), np.array([len(rgb)]), np.zeros(1)
-    return colors(world, ShownCloud(world.sheets[instance_id].vertices, rgb, *only), mode, None)
+    s = world.sheets[instance_id]
+    alone = np.array([instance_id]), np.array([len(s.rgb)]), np.zeros(1)
+    return colors(world, ShownCloud(s.vertices, s.rgb, np.zeros(s.rgb.shape, np.int8), *alone), mode, None)
 
 
 def color_of(world: ShownWorld, instance_id: int, mode: str) -> tuple[int, int, int]:
@@ -234,6 +233,7 @@ def pick(
     depth = step @ direction
     aside = np.sqrt(np.maximum((step**2).sum(axis=1) - depth**2, 0.0))
     near = np.flatnonzero((depth > 0) & (aside < _RAY_RADIUS * depth))
+    near = near[shown.normals[near] @ direction <= 0]
     first = int(near[np.argmin(depth[near])]) if len(near) else -1
     owner = int(shown.ids[np.searchsorted(np.cumsum(shown.counts), first, side="right")]) if first >= 0 else -1
     if first >= 0 and world.solid(owner):

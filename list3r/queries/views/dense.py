@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from list3r.memory.core.records import Instance
 from list3r.memory.store.derived import LruCache
 from list3r.memory.store.store import Store
-from list3r.queries.views.depth_frames import depth_frames
+from list3r.queries.relations import unit_of
+from list3r.queries.views.depth_frames import REST, depth_frames
 from list3r.queries.views.fused import FusionSettings, Ints, Surface, can_fuse, fused
 
 _MOST_FRAMES = 300
@@ -29,6 +30,9 @@ _CELLS = 500
 _MOST_FILES = 16
 _KEPT_VERTICES = 4_000_000
 """Files in the cache, and vertices in memory, that are kept."""
+_ON_M, _ASKED, _SHOWN = 0.05, 500, 0.5
+"""A surface point lies on triangles that are so near. So many points of an instance are asked, and this share must lie
+on its triangles."""
 _VERSION = 1
 """Of what is kept; another one where the same measurements give other triangles."""
 
@@ -37,11 +41,12 @@ def surfaces(store: Store) -> dict[int, Surface]:
     """Return the surface of each present instance, by id, and under `REST` what is of no instance in the main
     component; world coordinates.
     """
-    frames: dict[int, int] = {}
+    frames = dict.fromkeys([i.component for i in store.instances.all()], 0)
     for c in store.chunks.all():
         frames[c.component] = frames.get(c.component, 0) + c.last_frame - c.first_frame
     out: dict[int, Surface] = {}
     for component in sorted(frames, key=lambda k: (frames[k], -k)):
+        out.pop(REST, None)
         out |= component_surfaces(store, component)
     return dict(sorted(out.items()))
 
@@ -112,10 +117,10 @@ def fused_surfaces(store: Store, component: int) -> dict[int, Surface]:
     path = _folder() / f"{name}.npz"
     read = _read(path)
     if read is None:
-        whole, owner = fused(store, component)
-        read = _colored(store, component, whole), owner
+        read = _checked(store, component, *fused(store, component))
         _write(path, *read)
-    return known.parts.put(name, _cut(*read))
+    whole, owner = read
+    return known.parts.put(name, {n: whole.with_faces(faces) for n, faces in _faces_of(whole, owner).items()})
 
 
 def _name(store: Store, component: int) -> str:
@@ -134,25 +139,32 @@ def _name(store: Store, component: int) -> str:
     return told.hexdigest()[:32]
 
 
-def _colored(store: Store, component: int, whole: Surface) -> Surface:
-    """Return the surface of a memory without pictures with the colours of the nearest surface points of instances."""
-    chunks = [c.chunk_id for c in store.chunks.all() if c.component == component]
-    known = [_support(store, i) for i in store.instances.all() if i.component == component and _present(i)]
-    if any(store.keyframes.with_picture(k) for k in chunks) or not any(len(s.vertices) for s in known):
-        return whole
+def _checked(store: Store, component: int, whole: Surface, owner: Ints) -> tuple[Surface, Ints]:
+    """Return the surface in the colours of the nearest surface points of instances where no picture is kept, and the
+    owner of faces without instances of whose surface points few lie on them: stored depth hardly shows those.
+    """
     from scipy.spatial import cKDTree
 
-    points, rgb = (np.concatenate([getattr(s, name) for s in known]) for name in ("vertices", "rgb"))
-    return Surface(whole.vertices, whole.faces, rgb[cKDTree(points).query(whole.vertices)[1]])
+    reach, owner = _ON_M * unit_of(store), owner.copy()
+    known = {i.id: _support(store, i) for i in store.instances.all() if i.component == component and _present(i)}
+    for n, faces in _faces_of(whole, owner).items():
+        if n in known and len(known[n].vertices):
+            on, _, _ = whole.with_faces(faces).sampled(4 * len(faces))
+            some = known[n].vertices[:: -(-len(known[n].vertices) // _ASKED)]
+            if np.mean(cKDTree(on).query(some)[0] < reach) < _SHOWN:
+                owner[owner == n] = REST
+    chunks = [c.chunk_id for c in store.chunks.all() if c.component == component]
+    if any(store.keyframes.with_picture(k) for k in chunks) or not any(len(s.vertices) for s in known.values()):
+        return whole, owner
+    points, rgb = (np.concatenate([getattr(s, name) for s in known.values()]) for name in ("vertices", "rgb"))
+    return Surface(whole.vertices, whole.faces, rgb[cKDTree(points).query(whole.vertices)[1]]), owner
 
 
-def _cut(whole: Surface, owner: Ints) -> dict[int, Surface]:
-    """Return the part of each owner of faces. Shape (F,)."""
+def _faces_of(whole: Surface, owner: Ints) -> dict[int, NDArray[np.int32]]:
+    """Return the faces of each owner. Shape (F,)."""
     order = np.argsort(owner, kind="stable")
     ids, starts = np.unique(owner[order], return_index=True)
-    parts = np.split(whole.faces[order], starts[1:]) if len(ids) else []
-    every = Surface(whole.vertices, np.zeros((0, 3), np.int32), whole.rgb)
-    return {n: every.with_faces(part) for n, part in zip(ids.tolist(), parts, strict=True)}
+    return dict(zip(ids.tolist(), np.split(whole.faces[order], starts[1:]), strict=False))
 
 
 def _folder() -> Path:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from list3r.memory.store.store import Store
 from list3r.queries.relations import unit_of
-from list3r.queries.views.depth_frames import DepthFrame, depth_frames
+from list3r.queries.views.depth_frames import REST, DepthFrame, depth_frames
 
 Ints = NDArray[np.int64]
 
@@ -59,14 +59,17 @@ class Surface:
         used, faces = np.unique(chosen, return_inverse=True)
         return Surface(self.vertices[used], faces.reshape(-1, 3).astype(np.int32), self.rgb[used])
 
-    def sampled(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return points on the faces, by lot, and their colours. Shape (count, 3) both."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).astype(np.float64)
-        chosen = rng.choice(len(area), count, p=area / area.sum()) if area.any() else rng.choice(len(area), count)
+    def sampled(self, count: int, seed: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
+        """Return points on the faces by lot, their colours, and unit normals. Shape (count, 3) each."""
+        rng = np.random.default_rng(seed)
+        a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        across = np.cross(b - a, c - a)
+        area = np.linalg.norm(across, axis=1)
+        chosen = rng.choice(len(area), count, p=area / area.sum() if area.any() else None)
         weight = rng.dirichlet((1.0, 1.0, 1.0), count)[:, :, None]
         points, rgb = ((values[self.faces[chosen]] * weight).sum(axis=1) for values in (self.vertices, self.rgb))
-        return points.astype(np.float32), np.round(rgb).astype(np.uint8)
+        normals = across[chosen] / np.maximum(area[chosen], 1e-30)[:, None]
+        return points.astype(np.float32), np.round(rgb).astype(np.uint8), normals.astype(np.float32)
 
     def normals(self) -> NDArray[np.float64]:
         """Return unit normals of vertices, the faces around each weighted with their areas. Shape (V, 3)."""
@@ -201,6 +204,8 @@ class _Votes:
         from scipy.spatial import cKDTree
 
         key, owner = _commonest(*self._sum())
+        if not len(key):
+            return np.full(len(vertices), REST, np.int64)
         cells = np.stack([key >> 42, (key >> 21) & (2 * _CELLS - 1), key & (2 * _CELLS - 1)], axis=1) - _CELLS
         return np.asarray(owner[cKDTree((cells + 0.5) * self._cell).query(vertices)[1]])
 
