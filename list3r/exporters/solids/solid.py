@@ -30,6 +30,10 @@ _CARRIED_CELLS = 12.0
 """A seen surface is carried on so far into gaps."""
 _TURN_CELLS = 8.0
 """A turn of a radian counts as so many cells."""
+_UP = 0.8
+"""Cosine of the steepest slope of what is taken as level."""
+_LEVEL_CORNERS = 40
+"""Of a level surface, at least."""
 _OTHERS = 4000
 """Points of each neighbour that are looked at."""
 _AROUND_M = 0.1
@@ -166,6 +170,7 @@ def _surface(
     keep = np.where(behind, _HALF_SHELL_CELLS, 0.0)
     shift = np.clip(np.einsum("ij,ij->i", middle - vertices, normals) + keep, -1.0, 1.0)
     moved = vertices + _carried_on(vertices, normals, seen, shift)[:, None] * normals
+    _level(moved, normals, seen)
     at = {tuple(c): n for n, c in enumerate(corners.tolist())}
 
     def place(cells: NDArray[np.int64]) -> Array:
@@ -193,6 +198,21 @@ def _carried_on(vertices: Array, normals: Array, seen: NDArray[np.bool_], shift:
     weight = np.where(np.isfinite(away) & (np.abs(level) < 1.0), 1.0, 0.0)
     out[~seen] = (weight * shift[which]).sum(axis=1) / np.maximum(weight.sum(axis=1), 1.0)
     return out
+
+
+def _level(vertices: Array, normals: Array, seen: NDArray[np.bool_]) -> None:
+    """Lay flat what is level within a voxel, in place: tops, seats and boards, on which hulls of noise would tilt."""
+    z, left = vertices[:, 2], normals[:, 2] > _UP
+    while left.any():
+        heights = np.sort(z[left])
+        count = np.searchsorted(heights, heights + 2.0) - np.arange(len(heights))
+        first = int(count.argmax())
+        if count[first] < _LEVEL_CORNERS:
+            return
+        here = left & (z >= heights[first]) & (z < heights[first] + 2.0)
+        level = float(np.median(z[here & seen] if (here & seen).any() else z[here]))
+        z[here | ((z > level) & (z < level + 1.0))] = level
+        left &= ~here
 
 
 def _is_free(free: Mask, places: Array, step: Array) -> NDArray[np.bool_]:
