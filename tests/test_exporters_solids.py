@@ -12,6 +12,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.exporters.meshes.closed import ClosedSurface, net
 from list3r.exporters.solids.completion import completed
+from list3r.exporters.solids.convex import convex_parts
 from list3r.exporters.solids.evidence import gather
 from list3r.exporters.solids.solid import Solid, Surroundings, solid_of
 from list3r.memory.core.geometry import Array, Sim3
@@ -171,3 +172,10 @@ def test_what_a_simulator_cannot_take_is_refused(tmp_path: Path, capsys: pytest.
     for more, told in (([], "no metric scale"), (["--density", "-1"], "kilograms per cubic metre")):
         assert run([*words, *more]) == 2 and told in capsys.readouterr().err
     assert not (tmp_path / "sim").exists()
+
+
+def test_a_skin_that_is_laid_flat_is_no_part_and_nothing_fails() -> None:
+    solid = np.zeros((12, 12, 6), bool)
+    solid[:, :, :3], solid[2:5, 2:5, 3:5] = True, True
+    parts = convex_parts(solid, lambda cells: np.minimum(cells, [99, 99, 3]).astype(float))
+    assert len(parts) == 1 and parts[0].volume() == pytest.approx(12 * 12 * 3)

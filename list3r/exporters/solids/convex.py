@@ -58,7 +58,7 @@ def convex_parts(
         for one in pieces[len(pieces) == 1 :]:
             heapq.heappush(queue, one)
     done = sorted(done, key=lambda p: -len(p.cells))[: s.parts]
-    return tuple(_hull(place(piece.corners), s.corners) for piece in done)
+    return tuple(part for piece in done if (part := _hull(place(piece.corners), s.corners)) is not None)
 
 
 @dataclass(frozen=True, order=True)
@@ -166,11 +166,17 @@ def _middle(at: Cells) -> int:
     return int((at.min() + at.max() - 1) // 2)
 
 
+_FLAT = 1e-3
+"""Share of the longest side: thinner parts are skins that carry nothing."""
 _DIRECTIONS = np.random.default_rng(0).normal(size=(400, 3))
 
 
-def _hull(points: Array, most: int) -> ClosedSurface:
-    """Return the hull of points with at most so many corners: those farthest along directions all around."""
+def _hull(points: Array, most: int) -> ClosedSurface | None:
+    """Return the hull of points with at most so many corners: those farthest along directions all around; None where
+    the voxels were laid flat.
+    """
+    if np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2] < _FLAT * np.ptp(points, axis=0).max():
+        return None
     whole = hull(points)
     if len(whole.vertices) <= most:
         return whole

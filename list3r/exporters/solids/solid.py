@@ -141,7 +141,8 @@ def solid_of(instance: Instance, around: Surroundings) -> Solid | None:
     surface, seen, place = _surface(evidence, solid, points)
     nearest = np.asarray(cKDTree(around.support.points).query(surface.vertices, k=[1, 2, 3, 4])[1])
     rgb = np.round(around.support.rgb[nearest].astype(np.float64).mean(axis=1)).astype(np.uint8)
-    return Solid(InstanceMesh(surface, rgb, "solid"), seen, convex_parts(solid, place))
+    parts = convex_parts(solid, place) or (hull(mesh.surface.vertices),)
+    return Solid(InstanceMesh(surface, rgb, "solid"), seen, parts)
 
 
 def upright_axes(rotation: Array) -> Array:
