@@ -41,7 +41,8 @@ class MjcfSettings:
 
 
 def write_mjcf(store: Store, folder: str | Path, settings: MjcfSettings | None = None) -> tuple[Path, ...]:
-    """Write `scene.xml` and `meshes/` with what is seen of each thing of the main component; return the files.
+    """Write `scene.xml` and `meshes/` with what is seen of each thing of the main component; return the files, the
+    model first.
 
     With a density each thing is a free body whose mass is an estimate; what hangs on a wall, and everything without a
     density, is fixed. Moving and removed instances, and those with too few points for a mesh, are left out. Raises
@@ -71,7 +72,7 @@ def write_mjcf(store: Store, folder: str | Path, settings: MjcfSettings | None =
                 _add_thing(asset, world, i, solid, density, temporary / "meshes")
         Xml.indent(root)
         Xml.ElementTree(root).write(temporary / "scene.xml", encoding="utf-8", xml_declaration=True)
-    return (folder / "scene.xml", *sorted((folder / "meshes").iterdir()))
+    return tuple(sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: (p.suffix != ".xml", p)))
 
 
 def _hanging(store: Store) -> set[int]:
