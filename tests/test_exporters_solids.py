@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from list3r.simulation.walk import viewing_poses
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.materials import Material
 from list3r.simulation.worlds.objects import SimulatedObject
-from tests.conftest import instance, write_small_room
+from tests.conftest import box_points, instance, write_small_room
 from tests.test_exporters_meshes import is_closed
 
 casting = pytest.importorskip("benchmarks.simulation.casting", reason="the checkout's benchmarks are not here")
@@ -179,3 +180,17 @@ def test_a_skin_that_is_laid_flat_is_no_part_and_nothing_fails() -> None:
     solid[:, :, :3], solid[2:5, 2:5, 3:5] = True, True
     parts = convex_parts(solid, lambda cells: np.minimum(cells, [99, 99, 3]).astype(float))
     assert len(parts) == 1 and parts[0].volume() == pytest.approx(12 * 12 * 3)
+
+
+def test_what_no_view_tells_about_is_closed_all_the_same() -> None:
+    points = box_points((0, 0, 0.2), (0.3, 0.3, 0.4), 500, 1).astype(np.float32)
+    support = Support(points, np.ones(500, np.float32), np.full((500, 3), 120, np.uint8))
+    record = instance(2, (0, 0, 0.2), (0.3, 0.3, 0.4), (120, 120, 120))
+    for tilt in (np.eye(3), np.array([[1, 0, 0], [0, 0, -1.0], [0, 1, 0]])):
+        turned = replace(record, box=replace(record.box, rotation=tilt))
+        for views in (
+            (),
+            (DepthView(1, 0, Sim3.identity(), 1.0, np.ones((12, 16), np.float32), (9.0, 9.0, 8.0, 6.0)),),
+        ):
+            solid = solid_of(turned, Surroundings(support, points.astype(float), views, 0.0, 1.0))
+            assert solid is not None and solid.parts and is_closed(solid.mesh.surface)
