@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import list3r
 from list3r.cli.app import run
 from list3r.exporters.meshes.closed import ClosedSurface, net
 from list3r.exporters.solids.completion import completed
+from list3r.exporters.solids.convex import convex_parts
 from list3r.exporters.solids.evidence import gather
 from list3r.exporters.solids.solid import Solid, Surroundings, solid_of
 from list3r.memory.core.geometry import Array, Sim3
@@ -22,7 +24,7 @@ from list3r.simulation.walk import viewing_poses
 from list3r.simulation.worlds import furniture as f
 from list3r.simulation.worlds.materials import Material
 from list3r.simulation.worlds.objects import SimulatedObject
-from tests.conftest import instance, write_small_room
+from tests.conftest import box_points, instance, write_small_room
 from tests.test_exporters_meshes import is_closed
 
 casting = pytest.importorskip("benchmarks.simulation.casting", reason="the checkout's benchmarks are not here")
@@ -118,13 +120,12 @@ def test_a_chair_has_a_seat_and_nothing_before_its_back() -> None:
 
 
 def test_nothing_fills_what_was_seen_through() -> None:
-    solid, thing = seen_thing(f.shelf((0.8, 0.32, 1.3), PLAIN), away=2.0)
+    solid, _ = seen_thing(f.shelf((0.8, 0.32, 1.3), PLAIN), away=2.0)
     assert not holds(solid.parts, places((-0.3, 0.0, 0.6), (0.3, 0.14, 0.7))).any()
     points = solid.mesh.surface.vertices
     evidence = gather(points, np.zeros((0, 3)), (), np.eye(3), 0.0, 1.0)
     evidence.free[:] = True
     assert not completed(evidence).any()
-    assert thing.label == "thing"
 
 
 def test_a_net_around_cells_is_closed_and_near_them() -> None:
@@ -172,3 +173,24 @@ def test_what_a_simulator_cannot_take_is_refused(tmp_path: Path, capsys: pytest.
     for more, told in (([], "no metric scale"), (["--density", "-1"], "kilograms per cubic metre")):
         assert run([*words, *more]) == 2 and told in capsys.readouterr().err
     assert not (tmp_path / "sim").exists()
+
+
+def test_a_skin_that_is_laid_flat_is_no_part_and_nothing_fails() -> None:
+    solid = np.zeros((12, 12, 6), bool)
+    solid[:, :, :3], solid[2:5, 2:5, 3:5] = True, True
+    parts = convex_parts(solid, lambda cells: np.minimum(cells, [99, 99, 3]).astype(float))
+    assert len(parts) == 1 and parts[0].volume() == pytest.approx(12 * 12 * 3)
+
+
+def test_what_no_view_tells_about_is_closed_all_the_same() -> None:
+    points = box_points((0, 0, 0.2), (0.3, 0.3, 0.4), 500, 1).astype(np.float32)
+    support = Support(points, np.ones(500, np.float32), np.full((500, 3), 120, np.uint8))
+    record = instance(2, (0, 0, 0.2), (0.3, 0.3, 0.4), (120, 120, 120))
+    for tilt in (np.eye(3), np.array([[1, 0, 0], [0, 0, -1.0], [0, 1, 0]])):
+        turned = replace(record, box=replace(record.box, rotation=tilt))
+        for views in (
+            (),
+            (DepthView(1, 0, Sim3.identity(), 1.0, np.ones((12, 16), np.float32), (9.0, 9.0, 8.0, 6.0)),),
+        ):
+            solid = solid_of(turned, Surroundings(support, points.astype(float), views, 0.0, 1.0))
+            assert solid is not None and solid.parts and is_closed(solid.mesh.surface)

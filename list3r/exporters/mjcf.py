@@ -33,6 +33,8 @@ class MjcfSettings:
 
     density: float | None = None
     """kg per cubic metre of the convex hull, for an estimate of the mass; None for things that are fixed."""
+    ids: tuple[int, ...] | None = None
+    """Of the instances that become bodies; None for all."""
     guessed_metre: bool = False
     """Take a guessed metre for one; masses then are off by three times its deviation."""
 
@@ -41,7 +43,8 @@ class MjcfSettings:
 
 
 def write_mjcf(store: Store, folder: str | Path, settings: MjcfSettings | None = None) -> tuple[Path, ...]:
-    """Write `scene.xml` and `meshes/` with what is seen of each thing of the main component; return the files.
+    """Write `scene.xml` and `meshes/` with what is seen of each thing of the main component; return the files, the
+    model first.
 
     With a density each thing is a free body whose mass is an estimate; what hangs on a wall, and everything without a
     density, is fixed. Moving and removed instances, and those with too few points for a mesh, are left out. Raises
@@ -65,13 +68,14 @@ def write_mjcf(store: Store, folder: str | Path, settings: MjcfSettings | None =
         Xml.SubElement(world, "light", pos="0 0 6", dir="0 0 -1", directional="true")
         _add_structure(world, [i for i in there if i.structure is not None], store)
         solids, held = Solids(store), _hanging(store)
-        for i in there:
+        wanted = None if s.ids is None else {store.instances.get(n).id for n in s.ids}
+        for i in there if wanted is None else [i for i in there if i.id in wanted]:
             if i.structure is None and not i.dynamic and (solid := solids.of(i)) is not None:
                 density = None if i.id in held else s.density
                 _add_thing(asset, world, i, solid, density, temporary / "meshes")
         Xml.indent(root)
         Xml.ElementTree(root).write(temporary / "scene.xml", encoding="utf-8", xml_declaration=True)
-    return (folder / "scene.xml", *sorted((folder / "meshes").iterdir()))
+    return tuple(sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: (p.suffix != ".xml", p)))
 
 
 def _hanging(store: Store) -> set[int]:

@@ -109,7 +109,7 @@ FORMATS: dict[str, Format] = {
         (),
         "a model for MuJoCo: things as bodies on fixed structure",
         settings="MjcfSettings",
-        options=("density", "guessed_metre"),
+        options=("density", "ids", "guessed_metre"),
     ),
     "colmap": Format("cameras.colmap", "write_colmap", (), "text model of COLMAP with pictures"),
     "nerfstudio": Format("cameras.nerfstudio", "write_nerfstudio", (), "transforms.json with pictures"),

@@ -67,7 +67,8 @@ def export(
         ),
     ] = None,
     ids: Annotated[
-        str | None, typer.Option("--ids", metavar="ID,...", help="simready: only these instances, such as 3,7,12.")
+        str | None,
+        typer.Option("--ids", metavar="ID,...", help="simready, mjcf: only these instances, such as 3,7,12."),
     ] = None,
     guessed_metre: Annotated[
         bool,

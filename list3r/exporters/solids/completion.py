@@ -7,6 +7,7 @@ down to what it stands on. Nothing fills space that was seen through, or that an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,11 @@ from scipy import ndimage
 from scipy.spatial import Delaunay, QhullError
 
 from list3r.exporters.solids.evidence import Evidence, Mask
+
+Cells = NDArray[np.int64]
+Image = Callable[[Cells, Cells, int], Cells]
+"""Mirrors voxels (N, 3) of a grid of a shape (3,), at a mirror so many half voxels off its middle."""
+_SHIFTS = 6
 
 
 @dataclass(frozen=True)
@@ -53,8 +59,8 @@ def completed(e: Evidence, settings: CompletionSettings | None = None) -> Mask:
         rim = np.moveaxis(may, axis, 0)
         rim[: e.rim], rim[-e.rim :] = False, False
     shell = e.shell & may
-    for axis in (0, 1):
-        shell |= _mirrored(shell, e.free, axis, s) & may
+    for image in (_left_right, _front_back, _diagonal):
+        shell |= _mirrored(shell, e.free, image, s) & may
     shell |= _feet(shell, may, e, s)
     solid = shell.copy()
     for axis in range(3):
@@ -70,14 +76,36 @@ def completed(e: Evidence, settings: CompletionSettings | None = None) -> Mask:
     return _large_parts(solid | (ndimage.binary_closing(solid, iterations=2) & may))
 
 
-def _mirrored(shell: Mask, free: Mask, axis: int, s: CompletionSettings) -> Mask:
-    """Return the mirrored shell where the instance is symmetric, as far as is known, else nothing."""
-    mirror = np.flip(shell, axis)
-    count = max(int(mirror.sum()), 1)
-    near = ndimage.binary_dilation(shell, iterations=2)
-    near_free = ndimage.binary_erosion(free)
-    contradicted, met = (mirror & near_free).sum() / count, (mirror & near).sum() / count
-    return mirror if contradicted <= s.mirrored_free and met >= s.mirrored_met else np.zeros_like(mirror)
+def _mirrored(shell: Mask, free: Mask, image: Image, s: CompletionSettings) -> Mask:
+    """Return the mirrored shell where the instance is symmetric, as far as is known, else nothing.
+
+    What was seen need not end where the instance does, so that mirrors some voxels off its middle are tried too.
+    """
+    out = np.zeros_like(shell)
+    near, inside_free = ndimage.binary_dilation(shell, iterations=2), ndimage.binary_erosion(free)
+    cells, best = np.argwhere(shell), -1.0
+    for shift in range(-_SHIFTS, _SHIFTS + 1):
+        at = image(cells, np.array(shell.shape), shift)
+        at = at[((at >= 0) & (at < shell.shape)).all(axis=1)]
+        contradicted, met = (float(m[tuple(at.T)].sum()) / max(len(at), 1) for m in (inside_free, near))
+        if contradicted <= s.mirrored_free and met >= s.mirrored_met and met - contradicted > best:
+            best = met - contradicted
+            out[:] = False
+            out[tuple(at.T)] = True
+    return out
+
+
+def _left_right(cells: Cells, shape: Cells, shift: int) -> Cells:
+    return np.asarray(np.stack([shape[0] - 1 + shift - cells[:, 0], cells[:, 1], cells[:, 2]], axis=1))
+
+
+def _front_back(cells: Cells, shape: Cells, shift: int) -> Cells:
+    return np.asarray(np.stack([cells[:, 0], shape[1] - 1 + shift - cells[:, 1], cells[:, 2]], axis=1))
+
+
+def _diagonal(cells: Cells, shape: Cells, shift: int) -> Cells:
+    aside = (shape[0] - shape[1]) // 2 + shift
+    return np.asarray(np.stack([cells[:, 1] + aside, cells[:, 0] - aside, cells[:, 2]], axis=1))
 
 
 def _feet(shell: Mask, may: Mask, e: Evidence, s: CompletionSettings) -> Mask:
@@ -149,21 +177,19 @@ def _next_stop(open_: Mask) -> NDArray[np.int64]:
 def _without_holes(cells: Mask, start: NDArray[np.int64], may: Mask) -> tuple[Mask, NDArray[np.int64]]:
     """Close small gaps of a surface where nothing was seen through."""
     closed = ndimage.binary_closing(np.pad(cells, 3), iterations=2)[3:-3, 3:-3] | cells
-    return _grown(cells, start, ndimage.binary_fill_holes(closed), may)
+    whole = ndimage.binary_fill_holes(closed)
+    return _grown(cells, start, whole if cells.sum() >= _WHOLE * whole.sum() else closed, may)
 
 
 def _whole(cells: Mask, start: NDArray[np.int64], may: Mask) -> tuple[Mask, NDArray[np.int64]]:
     """Take a surface on which things stand as whole up to its convex outline, where nothing was seen through."""
-    at = np.argwhere(cells)
-    level = start[cells]
-    if np.quantile(np.abs(level - np.median(level)), 0.9) > 1:
-        return _without_holes(cells, start, may)
+    level, at = start[cells], np.argwhere(cells)
     try:
         inside = Delaunay(at).find_simplex(np.argwhere(np.ones_like(cells))) >= 0
     except QhullError:
         return cells, start
-    if len(at) < _WHOLE * inside.sum():
-        return _without_holes(cells, start, may)
+    if np.quantile(np.abs(level - np.median(level)), 0.9) > 1 or len(at) < _WHOLE * inside.sum():
+        return cells, start
     return _grown(cells, start, inside.reshape(cells.shape) | cells, may)
 
 

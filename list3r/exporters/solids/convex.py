@@ -7,7 +7,6 @@ their axes are those of boards and legs, so that a few cuts need to be tried.
 from __future__ import annotations
 
 import heapq
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -34,6 +33,8 @@ class ConvexSettings:
     """Along each axis at once, at most,"""
     step: float = 0.25
     """where the area changes by so much of the most that it does."""
+    enough: float = 0.5
+    """One cut that saves this share of the excess is taken without a look at several at once."""
     corners: int = 64
     """Of a part at most: what simulators take (PhysX)."""
 
@@ -57,7 +58,7 @@ def convex_parts(
         for one in pieces[len(pieces) == 1 :]:
             heapq.heappush(queue, one)
     done = sorted(done, key=lambda p: -len(p.cells))[: s.parts]
-    return tuple(_hull(place(piece.corners), s.corners) for piece in done)
+    return tuple(part for piece in done if (part := _hull(place(piece.corners), s.corners)) is not None)
 
 
 @dataclass(frozen=True, order=True)
@@ -115,18 +116,27 @@ def _connected(cells: Cells) -> list[Cells]:
 def _cut(piece: _Piece, room: int, s: ConvexSettings) -> list[_Piece]:
     """Return the pieces of the cut that saves most excess for each further piece, at most `room`; itself where none
     saves any.
+
+    Several cuts at once are tried where one saves little: a ring is no better for being halved, an open box no better
+    without one of its walls.
     """
     steps = [_steps(piece.cells, axis, s) for axis in range(3)]
     middles = [_middle(piece.cells[:, axis]) for axis in range(3)]
     tried = [_cut_at([piece], axis, (at,)) for axis in range(3) for at in {*steps[axis], middles[axis]}]
-    for one, two in itertools.permutations(range(3), 2):
-        if one < two:
-            tried.append(_cut_at(_cut_at([piece], one, (middles[one],)), two, (middles[two],)))  # a ring
-        slices = _cut_at([piece], one, steps[one])
-        finer = [p for c in slices for p in ([c] if c.unfilled <= s.unfilled else _sliced(c, two, s))]
-        tried += [slices, finer]  # an open box: its boards, then its sides
+    if not any(_saved(piece, t) >= s.enough * piece.excess for t in tried):
+        slices = [_sliced(piece, axis, s) for axis in range(3)]
+        for one, two in ((0, 1), (0, 2), (1, 2)):
+            tried.append(_cut_at(_cut_at([piece], one, (middles[one],)), two, (middles[two],)))
+            for first, second in ((one, two), (two, one)):
+                finer = [[c] if c.unfilled <= s.unfilled else _sliced(c, second, s) for c in slices[first]]
+                tried.append([p for some in finer for p in some])
+        tried += slices
     useful = [t for t in tried if 1 < len(t) <= room]
-    return max(useful, key=lambda t: (piece.excess - sum(p.excess for p in t)) / (len(t) - 1), default=[piece])
+    return max(useful, key=lambda t: _saved(piece, t) / (len(t) - 1), default=[piece])
+
+
+def _saved(piece: _Piece, pieces: Sequence[_Piece]) -> float:
+    return piece.excess - sum(p.excess for p in pieces)
 
 
 def _sliced(piece: _Piece, axis: int, s: ConvexSettings) -> list[_Piece]:
@@ -156,11 +166,17 @@ def _middle(at: Cells) -> int:
     return int((at.min() + at.max() - 1) // 2)
 
 
+_FLAT = 1e-3
+"""Share of the longest side: thinner parts are skins that carry nothing."""
 _DIRECTIONS = np.random.default_rng(0).normal(size=(400, 3))
 
 
-def _hull(points: Array, most: int) -> ClosedSurface:
-    """Return the hull of points with at most so many corners: those farthest along directions all around."""
+def _hull(points: Array, most: int) -> ClosedSurface | None:
+    """Return the hull of points with at most so many corners: those farthest along directions all around; None where
+    the voxels were laid flat.
+    """
+    if np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2] < _FLAT * np.ptp(points, axis=0).max():
+        return None
     whole = hull(points)
     if len(whole.vertices) <= most:
         return whole

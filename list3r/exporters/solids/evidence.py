@@ -33,7 +33,7 @@ class VoxelSettings:
 
     along: int = 40
     """Along the longest side."""
-    finest_m: float = 0.01
+    finest_m: float = 0.007
     coarsest_m: float = 0.03
 
 

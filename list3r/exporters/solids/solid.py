@@ -30,6 +30,10 @@ _CARRIED_CELLS = 12.0
 """A seen surface is carried on so far into gaps."""
 _TURN_CELLS = 8.0
 """A turn of a radian counts as so many cells."""
+_UP = 0.8
+"""Cosine of the steepest slope of what is taken as level."""
+_LEVEL_CORNERS = 40
+"""Of a level surface, at least."""
 _OTHERS = 4000
 """Points of each neighbour that are looked at."""
 _AROUND_M = 0.1
@@ -38,6 +42,10 @@ _STANDS_M = 0.25
 """What it stands on lies at most so far from the lowest that was seen of an instance."""
 _INTO_M = 0.05
 """And at most so far above that."""
+_UPRIGHT = 0.999
+"""Cosine of the tilt from which what a thing stands on has no height along its axes."""
+_KEPT = 512
+"""Neighbours whose points are kept in memory."""
 _CHUNKS = 64
 """Whose depth pictures are kept in memory."""
 _LEAST_UNDER = 20
@@ -80,6 +88,7 @@ class Solids:
         self._all = {i.id: i for i in store.instances.all()}
         self._on = {r.subject: r.object for r in store.relations.all() if r.predicate == "on"}
         self._views = lru_cache(_CHUNKS)(self._read_views)
+        self._points = lru_cache(_KEPT)(self._read_points)
 
     def of(self, instance: Instance) -> Solid | None:
         """Return the solid of an instance, None where its surface points allow none."""
@@ -93,12 +102,14 @@ class Solids:
         low, high = instance.aabb + np.array([[-_AROUND_M], [_AROUND_M]]) * self._metre
         near = [self._all[n] for n in self._store.instances.ids_in_box(low, high) if n in self._all]
         beside = [i for i in near if i.component == instance.component and i.id != instance.id]
-        clouds = [thinned_support(self._store, i, _OTHERS).points.astype(np.float64) for i in beside]
-        others = np.concatenate([np.zeros((0, 3)), *clouds])
+        others = np.concatenate([np.zeros((0, 3)), *(self._points(i.id) for i in beside)])
         others = others[((others > low) & (others < high)).all(axis=1)]
         chunks = sorted({o.chunk_id for o in self._store.observations.of(instance.id)})
         views = [view for k in chunks for view in self._views(k)]
         return Surroundings(support, others, views, self._stands(instance), self._metre)
+
+    def _read_points(self, instance_id: int) -> Array:
+        return thinned_support(self._store, self._all[instance_id], _OTHERS).points.astype(np.float64)
 
     def _read_views(self, chunk_id: int) -> list[DepthView]:
         keyframes = self._store.keyframes.of(chunk_id)
@@ -109,7 +120,7 @@ class Solids:
         lowest, under = float(instance.aabb[0, 2]), self._all.get(self._on.get(instance.id, -1))
         if under is None:
             return lowest
-        points = thinned_support(self._store, under, _OTHERS).points
+        points = self._points(under.id)
         here = ((points[:, :2] > instance.aabb[0, :2]) & (points[:, :2] < instance.aabb[1, :2])).all(axis=1)
         heights = points[here if here.sum() >= _LEAST_UNDER else slice(None), 2]
         below = (lowest - heights) / self._metre
@@ -127,17 +138,19 @@ def solid_of(instance: Instance, around: Surroundings) -> Solid | None:
         return None
     points = around.support.points.astype(np.float64)
     points = points[dense(points)]
-    if not around.views:
+    axes = upright_axes(instance.box.rotation)
+    stands = around.stands if axes[2, 2] > _UPRIGHT else np.inf
+    evidence = gather(points, around.others, around.views, axes, stands, around.metre) if around.views else None
+    solid = None if evidence is None else completed(evidence)
+    if evidence is None or solid is None or not solid.any():
         away = np.asarray(cKDTree(points).query(mesh.surface.vertices)[0])
         seen: NDArray[np.bool_] = away < 2 * point_spacing(points.astype(np.float32))
         return Solid(mesh, np.asarray(seen[mesh.surface.faces].all(axis=1)), (hull(mesh.surface.vertices),))
-    axes = upright_axes(instance.box.rotation)
-    evidence = gather(points, around.others, around.views, axes, around.stands, around.metre)
-    solid = completed(evidence)
     surface, seen, place = _surface(evidence, solid, points)
     nearest = np.asarray(cKDTree(around.support.points).query(surface.vertices, k=[1, 2, 3, 4])[1])
     rgb = np.round(around.support.rgb[nearest].astype(np.float64).mean(axis=1)).astype(np.uint8)
-    return Solid(InstanceMesh(surface, rgb, "solid"), seen, convex_parts(solid, place))
+    parts = convex_parts(solid, place) or (hull(mesh.surface.vertices),)
+    return Solid(InstanceMesh(surface, rgb, "solid"), seen, parts)
 
 
 def upright_axes(rotation: Array) -> Array:
@@ -166,6 +179,7 @@ def _surface(
     keep = np.where(behind, _HALF_SHELL_CELLS, 0.0)
     shift = np.clip(np.einsum("ij,ij->i", middle - vertices, normals) + keep, -1.0, 1.0)
     moved = vertices + _carried_on(vertices, normals, seen, shift)[:, None] * normals
+    _level(moved, normals, seen)
     at = {tuple(c): n for n, c in enumerate(corners.tolist())}
 
     def place(cells: NDArray[np.int64]) -> Array:
@@ -193,6 +207,21 @@ def _carried_on(vertices: Array, normals: Array, seen: NDArray[np.bool_], shift:
     weight = np.where(np.isfinite(away) & (np.abs(level) < 1.0), 1.0, 0.0)
     out[~seen] = (weight * shift[which]).sum(axis=1) / np.maximum(weight.sum(axis=1), 1.0)
     return out
+
+
+def _level(vertices: Array, normals: Array, seen: NDArray[np.bool_]) -> None:
+    """Lay flat what is level within a voxel, in place: tops, seats and boards, on which hulls of noise would tilt."""
+    z, left = vertices[:, 2], normals[:, 2] > _UP
+    while left.any():
+        heights = np.sort(z[left])
+        count = np.searchsorted(heights, heights + 2.0) - np.arange(len(heights))
+        first = int(count.argmax())
+        if count[first] < _LEVEL_CORNERS:
+            return
+        here = left & (z >= heights[first]) & (z < heights[first] + 2.0)
+        level = float(np.median(z[here & seen] if (here & seen).any() else z[here]))
+        z[here | ((z > level) & (z < level + 1.0))] = level
+        left &= ~here
 
 
 def _is_free(free: Mask, places: Array, step: Array) -> NDArray[np.bool_]:
