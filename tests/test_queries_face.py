@@ -276,6 +276,8 @@ def test_a_notebook_shows_short_tables_with_pictures(tmp_path: Path) -> None:
         assert answers._repr_html_().count("<tr>") == 21 and "100 more" in answers._repr_html_()
         shown = memory[MUG]._repr_html_()
         assert "<script>" not in shown and f"<td>{MUG}</td>" in shown and memory[MUG].description in shown
+        near = memory.nearest(MUG, 1)
+        assert repr(near).startswith(f"[<Match {near[0].score:.2f}: Instance {near[0].instance.id}: ")
         assert len(repr(answers)) < 4000 and "array(" not in repr(memory[MUG]) + repr(memory.nearest(MUG))
         after = memory.instances()
     assert "<img" not in after._repr_html_() and "mug" in after._repr_html_()

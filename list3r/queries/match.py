@@ -45,6 +45,10 @@ class Match:
         """The picture to look at: of the frame asked about, else where the thing is seen best."""
         return self.view or self.instance.best_view
 
+    def __repr__(self) -> str:
+        far = "" if self.distance_m is None else f"{self.distance_m:.2f} away, "
+        return f"<Match {self.score:.2f}: {repr(self.instance)[1:-1]}; {far}{self.reason}>"
+
 
 class Matches(Answers[Match]):
     """Answers, the best first, with what can be said of the question as a whole."""
