@@ -106,7 +106,7 @@ def _figures(root: Path, memory: Path, truth: Trajectory, colour: bool) -> dict[
     scene = json.loads(memory.with_suffix(".json").read_text(encoding="utf-8"))
     errors = evaluate_trajectory(truth, read_tum(memory.with_suffix(".tum")))
     return {
-        "frames": len(truth.times_s),
+        "frames": len(truth.time_s),
         "posed": sum(c["posed_frames"] for c in scene["components"]),
         "ate_m": round(float((errors.ate_sim3_m if colour else errors.ate_se3_m).rmse), 5),
         "instances": sum(not e["structure"] for e in scene["instances"]),
