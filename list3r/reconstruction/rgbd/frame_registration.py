@@ -38,7 +38,7 @@ NormalEquations = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _CELL_PX, _CELL_POINTS = 16, 10
 """Part of the image in which normals may be alike but for noise, and how many tell it."""
-_CALM, _CALM_SHARE = 0.1, 1.4
+_CALM, _CALM_SHARE = 0.25, 1.2
 """Quantile of the cells that tells noise, and the mean variance of a bare wall's cells over that quantile of them."""
 
 
