@@ -150,7 +150,7 @@ def measure(r: Recording, learned: dict[str, Aggregation], aliked: Path | None) 
 
     def add(name: str, likeness: Array, ms: float) -> None:
         rows[name] = {k: recall(np.where(apart, likeness, -np.inf), t) for k, t in truths.items()} | {
-            "ms": round(ms, 2)
+            "ms": round(float(ms), 2)
         }
 
     vectors = {"hashed words": hashed(sift), "vlad": np.stack([describe_frame(d) for d in sift])}
