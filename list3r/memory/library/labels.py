@@ -170,17 +170,13 @@ def decide_by_rank(
     known: Mapping[str, Collection[str] | None] | None = None,
     settings: LabelSettings | None = None,
 ) -> tuple[str, float, float] | None:
-    """Return what `decide` says of all sources but the learned discoverer; where they name nothing, what it says of
-    that one alone, if that is likely enough with all of them too.
-    """
+    """Return what `decide` says of all sources but the learned discoverer, and of that one where they name nothing."""
     s = settings or LabelSettings()
     others = {source: v for source, v in votes.items() if source != OWN_NAMES}
-    if named := decide(others, known, replace(s, min_confidence=max(s.min_confidence, s.min_detected))):
-        return named
-    lenient = replace(s, min_confidence=max(s.min_confidence, s.min_own))
-    own = decide({n: v for n, v in votes.items() if n == OWN_NAMES}, known, lenient)
-    every = decide(votes, known, lenient)
-    return every if own is not None and every is not None and own[0] == every[0] else None
+    own = {source: v for source, v in votes.items() if source == OWN_NAMES}
+    return decide(others, known, replace(s, min_confidence=max(s.min_confidence, s.min_detected))) or decide(
+        own, known, replace(s, min_confidence=max(s.min_confidence, s.min_own))
+    )
 
 
 def _said(votes: Votes, name: str, source: str, known: Collection[str] | None, likeness: float) -> tuple[float, float]:

@@ -72,7 +72,7 @@ class ChangeMatching:
                 along = any(self._went_along(placed.now, *way, session) for way in ways)
                 if along or self._scrap(placed.now, left, session, before=True):
                     placed.state = "removed"
-                elif self._wholly_gone(placed, found):
+                elif found.told >= self._s.told:
                     self._remove(placed, session, found)
         for n in fresh:
             scrap = n in came and self._scrap(n, came, session, before=False)
@@ -131,13 +131,6 @@ class ChangeMatching:
         if found.verdict == "there" and self._counts[placed.now]:
             self._still_there(placed, session, found)
         return None
-
-    def _wholly_gone(self, placed: PlacedInstance, found: PlaceVisibility) -> bool:
-        """Return whether enough of an instance was looked for to say that it was removed; a glance at one side may go
-        past it.
-        """
-        enough = len(found.frames) >= self._s.removed_frames or placed.now in self._instead
-        return enough and found.told >= self._s.told
 
     def _well_seen(self, n: int, before: int) -> bool:
         return self._p.frames(n, before) >= self._s.least_frames

@@ -79,9 +79,7 @@ class ChangeSettings:
     replaced_link_m: float = 0.045
     """within this."""
     told: float = 0.5
-    """Share of all of an instance's surface of which frames must tell for it to be removed,"""
-    removed_frames: int = 5
-    """and the frames that must see that; a glance at one side of what is still there goes past it in up to 4."""
+    """Share of all of an instance's surface of which frames must tell for it to be removed."""
     part: float = 0.7
     """Share of its surface inside the box of a larger instance of the same fate from which it is a scrap of that."""
     least_frames: int = 12
