@@ -18,6 +18,7 @@ from list3r.memory.core.geometry import rotation_exp, umeyama
 from list3r.reconstruction.mvs.settings import MvsSettings, SweepSettings
 from list3r.reconstruction.registry import MODELS, ModelOptions, make_reconstructor
 from list3r.reconstruction.sfm.calibration import calibrate
+from list3r.reconstruction.sfm.mapping import SparseMap, best_of
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
 from list3r.reconstruction.sfm.settings import CameraCalibrationSettings, CornerSettings, SfmSettings
 from list3r.reconstruction.sfm.tracks import follow_corners
@@ -247,3 +248,13 @@ def test_redkitchen_in_colour(shared_data: Path):
     S = umeyama(made.T_chunk_cam[made.posed, :3, 3], centres(frames)[made.posed], with_scale=True)
     off = np.linalg.norm(S.apply(made.T_chunk_cam[made.posed, :3, 3]) - centres(frames)[made.posed], axis=1)
     assert np.sqrt((off**2).mean()) < 0.01
+
+
+def test_of_several_maps_the_one_that_explains_the_pictures_best_is_taken():
+    def grown(keyframes: int, error_px: float) -> list[SparseMap]:
+        return [SparseMap({k: np.eye(4) for k in range(keyframes)}, {}, CAMERA, 0.0, error_px)]
+
+    straight = grown(20, 0.46)
+    assert best_of([grown(20, 0.50), straight, grown(20, 0.49)], 0.95) is straight
+    assert best_of([grown(10, 0.30), straight, []], 0.95) is straight, "a small map has little to explain"
+    assert best_of([[], []], 0.95) == []

@@ -15,9 +15,9 @@ from list3r.frames.source import SourceOptions, open_source
 from list3r.memory.core.geometry import umeyama
 from list3r.reconstruction.sfm.consistency import contradicted
 from list3r.reconstruction.sfm.links import context_step
-from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, build_maps
+from list3r.reconstruction.sfm.mapping import KeyframeView, MapProblem, SparseMap, agreed, build_maps, first_pairs
 from list3r.reconstruction.sfm.reconstructor import SfmReconstructor
-from list3r.reconstruction.sfm.settings import LinkSettings
+from list3r.reconstruction.sfm.settings import LinkSettings, MappingSettings
 from list3r.reconstruction.sfm.tracks import CornerTracks
 from tests.rgbd_scenes import CAMERA
 from tests.test_sfm import FRAMES, Held, centres, walk
@@ -100,6 +100,37 @@ def test_the_faster_the_picture_changes_the_nearer_are_the_frames_around(
         none, nowhere, tuple(range(keyframes)), np.zeros(frames, np.int64), np.zeros(frames, np.float32)
     )
     assert context_step(tracks, LinkSettings()) == step
+
+
+def sized(keyframes: int, error_px: float) -> list[SparseMap]:
+    return [SparseMap({k: np.eye(4) for k in range(keyframes)}, {}, CAMERA, 0.0, error_px)]
+
+
+@pytest.mark.parametrize(
+    ("grown", "same"),
+    [
+        ([sized(10, 0.4)], False),
+        ([sized(10, 0.4), sized(10, 0.401)], True),
+        ([sized(10, 0.4), sized(10, 0.44)], False),
+        ([sized(10, 0.4), sized(9, 0.4)], False),
+        ([sized(10, 0.4), [], sized(10, 0.4)], True),
+        ([[], []], False),
+        ([sized(10, 0.4) + sized(4, 0.4), sized(10, 0.4) + sized(4, 0.4)], False),
+    ],
+)
+def test_two_maps_agree_in_their_keyframes_and_their_error(grown: list[list[SparseMap]], same: bool) -> None:
+    assert agreed(grown, MappingSettings()) is same
+
+
+def test_maps_are_also_grown_from_what_shares_most_in_the_second_and_the_last_third() -> None:
+    none = KeyframeView(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+    keys = range(0, 60, 2)
+    steps = {(a, b): np.zeros((200 - (b - a), 2), np.int64) for a in keys for b in keys if a < b <= a + 20}
+    steps[24, 34] = steps[50, 58] = np.zeros((500, 2), np.int64)  # five and four keyframes on
+    steps[30, 32] = steps[4, 14] = steps[52, 100] = np.zeros((900, 2), np.int64)  # next, first third, not its own
+    problem = MapProblem({**dict.fromkeys(keys, none), 100: none}, steps, context=frozenset([100]))
+    assert first_pairs(problem, MappingSettings()) == [(24, 34), (50, 58)]
+    assert first_pairs(MapProblem(dict.fromkeys(range(3), none), {}), MappingSettings()) == []
 
 
 def test_pairs_of_which_nothing_was_verified_contradict_nothing() -> None:

@@ -12,6 +12,7 @@ from list3r.association.revisits.reprojection_edge import refine_loop
 from list3r.frames.base import Camera
 from list3r.memory.core.geometry import Sim3, rotation_exp, rotation_log
 from list3r.memory.core.records import Edge, FrameSamples, Keyframe
+from list3r.reconstruction.sfm.mapping import KeyframeView, SparseMap, steady
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 TRUE = Sim3(np.asarray(1.4), rotation_exp(np.array([0.2, -0.5, 0.1])), np.array([0.3, -1.0, 2.0]))
@@ -130,3 +131,17 @@ def test_a_loop_without_features_stays_as_it_is():
     blind = replace(v, points_cam=np.full_like(v.points_cam, np.nan))
     edge = loop(TRUE)
     assert refine_loop(edge, u, blind, CAMERA, CAMERA) is edge
+
+
+@pytest.mark.parametrize(("scale", "one_scale"), [(1.0, True), (2.0, True), (15.0, False)])
+def test_a_map_whose_scale_was_lost_on_the_way_is_not_steady(scale: float, one_scale: bool) -> None:
+    rng = np.random.default_rng(7)
+    poses, points, seen = {}, {}, {}
+    for key in range(6):
+        size = scale if key > 2 else 1.0
+        ids = np.arange(50 * key, 50 * key + 50)
+        poses[key] = np.eye(4)
+        poses[key][0, 3] = 0.1 * key * size
+        points |= {int(n): size * np.array([0, 0, 3.0]) + rng.uniform(-0.5, 0.5, 3) for n in ids}
+        seen[key] = KeyframeView(ids, np.zeros((50, 2), np.float32))
+    assert steady(SparseMap(poses, points, CAMERA, seen=seen), 4.0) is one_scale

@@ -2,14 +2,16 @@
 
 Nothing is written to the disk: the correspondences are in a database in memory. pycolmap's pixels have their origin at
 the corner of the upper left pixel, half a pixel from ours. Everything is seeded and uses one thread, so that the same
-correspondences give the same structure. A map is grown roughly and adjusted once it is complete (research/colour-video
-0181).
+correspondences give the same structure. Growing a map is a local search, so maps are grown from pairs in up to three
+places of a chunk (research/colour-video 0064), roughly, and the kept one is adjusted once it is complete
+(research/colour-video 0181).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -100,9 +102,37 @@ def build_maps(
     if cache is None:
         return []
     work = _Work(cache, problem, camera, free_camera, chosen)
-    own = [(without_context(found, problem), model) for found, model in _grown(work)]
-    own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
-    return [_finished(work, found, model) for found, model in own]
+    grown: list[list[SparseMap]] = []
+    models: dict[int, Any] = {}
+    for pair in (None, *(() if free_camera == "focal" else first_pairs(problem, chosen)[: chosen.given_pairs])):
+        made = _grown(work, pair)
+        maps = [found for found, _ in made]
+        own = [(without_context(found, problem), model) for found, model in made]
+        own = sorted((m for m in own if len(m[0].T_map_cam) >= 2), key=lambda m: _largest_first(m[0]))
+        grown.append([found for found, _ in own])
+        models |= {id(found): model for found, model in own}
+        if agreed(grown, chosen) or (maps and all(steady(m, chosen.steady) for m in maps)):
+            break
+        if not maps and pair is None and work.only_turns(problem.views):
+            break
+    best = best_of(grown, chosen.alike)
+    held = {key for found in best for key in found.T_map_cam}
+    kept = [*best, *(found for found in grown[0] if not held & found.T_map_cam.keys())]
+    return [_finished(work, found, models[id(found)]) for found in kept]
+
+
+def first_pairs(problem: MapProblem, settings: MappingSettings) -> list[tuple[int, int]]:
+    """Further initial pairs of keyframes: those that share most in the second and the last third."""
+    own = sorted(problem.views.keys() - problem.context)
+    place = {key: n for n, key in enumerate(own)}
+    least, most = settings.given_steps
+    out = []
+    for third in (1, 2):
+        part = own[third * len(own) // 3 : (third + 1) * len(own) // 3]
+        steps = {p: place[p[1]] - place[p[0]] for p in problem.pairs if p[0] in part and p[1] in place}
+        near = [(len(problem.pairs[p]), p) for p, step in sorted(steps.items()) if least <= step <= most]
+        out += [max(near)[1]] if near else []
+    return out
 
 
 @dataclass(frozen=True)
@@ -114,24 +144,36 @@ class _Work:
     camera: Camera
     free_camera: str
     settings: MappingSettings
+    turns: dict[frozenset[int], bool] = field(default_factory=dict)
+    """Whether the camera only rotates in some of the views, as far as it was tested."""
+
+    def only_turns(self, keys: Collection[int]) -> bool:
+        """Return whether the camera only rotates in some of the views."""
+        some = frozenset(keys)
+        if some not in self.turns:
+            places = {key: view.xy for key, view in self.problem.views.items()}
+            self.turns[some] = only_turns(places, self.problem.pairs, keys, self.camera, self.settings.turning)
+        return self.turns[some]
 
 
-def _grown(work: _Work) -> list[tuple[SparseMap, Any]]:
-    """Maps that grow from two keyframes, each with pycolmap's own; none of a camera that only rotates."""
+def _grown(work: _Work, pair: tuple[int, int] | None) -> list[tuple[SparseMap, Any]]:
+    """Maps that grow from two keyframes, one from a given pair, each with pycolmap's own; none of a camera that only
+    rotates."""
     settings = work.settings
     options = mapper_options(work.camera, work.free_camera, settings)
     if settings.rough_iterations:
         options.ba_global_max_num_iterations = settings.rough_iterations
         options.ba_global_max_refinements = 1
-    free = work.free_camera == "focal"
-    options.mapper.init_min_tri_angle = settings.free_angle_deg if free else settings.first_angle_deg
+    given = pair is not None or work.free_camera == "focal"
+    options.mapper.init_min_tri_angle = settings.given_angle_deg if given else settings.first_angle_deg
+    if pair is not None:
+        options.init_image_id1, options.init_image_id2 = pair[0] + 1, pair[1] + 1
+        options.max_num_models = 1
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, work.cache, manager).run()
     models = [manager.get(k) for k in range(manager.size())]
     maps = [(m, model) for m, model in ((_map_of(work, model), model) for model in models) if _enough(m, settings)]
-    places = {key: view.xy for key, view in work.problem.views.items()}
-    pairs, camera = work.problem.pairs, work.camera
-    return [(m, model) for m, model in maps if not only_turns(places, pairs, m.T_map_cam, camera, settings.turning)]
+    return [(m, model) for m, model in maps if not work.only_turns(m.T_map_cam)]
 
 
 def _finished(work: _Work, found: SparseMap, model: Any) -> SparseMap:
@@ -183,6 +225,37 @@ def without_context(found: SparseMap, problem: MapProblem) -> SparseMap:
     poses = {k: T for k, T in found.T_map_cam.items() if k not in problem.context}
     seen = {k: view for k, view in found.seen.items() if k not in problem.context}
     return replace(found, T_map_cam=poses, seen=seen)
+
+
+def steady(found: SparseMap, most: float) -> bool:
+    """Return whether the depth of keyframes' points changes by less than a factor from one to the next.
+
+    A map that lost its scale where the camera rotated explains the pictures as well, but there depth jumps (decision
+    0128).
+    """
+    if most <= 1.0:
+        return False
+    deep = []
+    for key, T in sorted(found.T_map_cam.items()):
+        points = np.array([found.points[n] for n in found.seen[key].ids.tolist()]).reshape(-1, 3)
+        deep += [float(np.median(np.linalg.norm(points - T[:3, 3], axis=1)))] if len(points) else []
+    return bool(np.abs(np.diff(np.log(deep))).max(initial=0.0) <= np.log(most))
+
+
+def agreed(grown: Sequence[list[SparseMap]], settings: MappingSettings) -> bool:
+    """Return whether two unbroken maps hold as many keyframes and explain the pictures equally well.
+
+    Deformed maps may agree too, but where a map is deformed some part of it often does not fit.
+    """
+    largest = [(len(maps[0].T_map_cam), maps[0].error_px) for maps in grown if len(maps) == 1]
+    return any(a == b and max(e, f) <= settings.same_error * min(e, f) for (a, e), (b, f) in combinations(largest, 2))
+
+
+def best_of(grown: Sequence[list[SparseMap]], alike: float) -> list[SparseMap]:
+    """Return the maps whose largest one has the least error among those about as large as any."""
+    most = max((len(maps[0].T_map_cam) for maps in grown if maps), default=0)
+    large = [maps for maps in grown if maps and len(maps[0].T_map_cam) >= alike * most]
+    return min(large, key=lambda maps: maps[0].error_px, default=[])
 
 
 def _borne_out(found: SparseMap, work: _Work) -> SparseMap:

@@ -146,8 +146,18 @@ class MappingSettings:
     """Largest error of an observation that is kept."""
     first_angle_deg: float = 6.0
     """Least angle between the rays of the first two keyframes, where a known camera lets the mapper choose them."""
-    free_angle_deg: float = 3.0
-    """The same where the camera is estimated as well."""
+    given_angle_deg: float = 3.0
+    """The same where the pair is given, or the camera is estimated as well."""
+    given_steps: tuple[int, int] = (4, 7)
+    """Fewest and most keyframes from the first to the second one of a given pair."""
+    given_pairs: int = 2
+    """Most pairs from which a map is grown in addition to the one that the mapper chooses."""
+    steady: float = 0.0
+    """No other pair is tried where the points' depth changes by less than this factor from each keyframe to the next;
+    0 for maps that are always compared with others."""
+    same_error: float = 1.005
+    """Two maps of errors within this ratio are the same, and no third is grown: right ones of one chunk differ by 0.1
+    to 0.7 %, deformed ones are 9 to 12 % off (simulated walks 101 to 104)."""
     growth: float = 1.4
     """The whole map is adjusted each time it has grown by this factor."""
     whole_iterations: int = 25
@@ -169,6 +179,8 @@ class MappingSettings:
     """A map of all keyframes at once is tried where rotations lose that much of the scale, or maps separate keyframes
     with matches. Maps of chunks that were broken have 0.06 to 0.16, others at most 0.046 (research/colour-video 0208).
     """
+    alike: float = 0.95
+    """Maps with at least this share of the keyframes of the largest are compared by their error."""
     point_angle_deg: float = 1.0
     """Least angle between the rays to a point."""
     least_points: int = 40
