@@ -21,8 +21,8 @@ import numpy as np
 from machine import run_list3r, write_json
 
 import list3r
+from list3r.memory.library.overlap.pair_scores import box_iou
 from list3r.memory.store.store import Store
-from list3r.semantics.nanodet import overlaps
 
 TRUTH: dict[str, tuple[str, int, tuple[int, int, int, int]]] = {
     "white mug": ("cup", 300, (56, 212, 106, 266)),
@@ -57,7 +57,7 @@ def instances_of(store: Store) -> dict[str, int | None]:
                 other = boxes.get((chunk_id, instance), one)
                 whole = np.concatenate([np.minimum(one[:2], other[:2]), np.maximum(one[2:], other[2:])])
                 boxes[chunk_id, instance] = whole
-        fits = {key: float(overlaps(np.array(box, np.float32), b[None])[0]) for key, b in boxes.items()}
+        fits = {key: float(box_iou(np.array([box]), b[None])[0, 0]) for key, b in boxes.items()}
         best = max(fits, key=lambda key: fits[key], default=None)
         found[name] = best[1] if best is not None and fits[best] >= LEAST_OVERLAP else None
     return found

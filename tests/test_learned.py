@@ -29,9 +29,8 @@ from list3r.instances.learned.weights import COMPUTED, FORMAT, SHIPPED, load_wei
 from list3r.instances.registry import make_discoverer
 from list3r.instances.settings import InstanceSettings, SegmentSettings
 from list3r.memory.core.errors import OptionError
-from list3r.pipeline.choice import settings_asked, settings_resumed
+from list3r.pipeline.choice import settings_asked
 from list3r.pipeline.request import BuildRequest
-from list3r.pipeline.settings import BuildSettings
 from list3r.reconstruction.base import DepthNoise
 from tests.test_instances_library import SCENE, render, walk
 
@@ -172,14 +171,6 @@ def test_it_is_the_default_and_damage_to_its_weights_is_said(
     assert "\n" not in str(said.value)
     assert settings_asked(BuildRequest(discovery="eomt"), depth, "any")[0].discovery == "eomt"
     load_weights.cache_clear()
-
-
-def test_a_session_of_a_discoverer_that_is_gone_says_how_to_go_on() -> None:
-    depth = SourceInfo("tum", "walk", 9, 30.0, None, True, False, "x")
-    begun = BuildSettings(discovery="geometric")
-    with pytest.raises(OptionError, match="continue with --discovery learned"):
-        settings_resumed(BuildRequest(), begun, depth, "any")
-    assert settings_resumed(BuildRequest(discovery="learned"), begun, depth, "any")[0].discovery == "learned"
 
 
 def test_points_of_none_go_to_what_a_way_without_a_gap_leads_to() -> None:

@@ -342,7 +342,7 @@ def test_names_of_a_discoverer_become_labels(tmp_path: Path) -> None:
     from tests.conftest import box_points, chunk_result, local_instance
 
     mug = local_instance(0, box_points((0, 0, 2), (0.1, 0.1, 0.1), 300, 1), (200, 200, 200), np.arange(20))
-    mug = replace(mug, names=(("cup", 0.8), ("cup", 0.7), ("bowl", 0.4), ("cup", 0.75)))
+    mug = replace(mug, names=(("cup", 0.95), ("cup", 0.9), ("bowl", 0.4), ("cup", 0.95)))
     once = local_instance(1, box_points((1, 0, 2), (0.2, 0.1, 0.1), 300, 2), (10, 200, 20), np.arange(20))
     once = replace(once, names=(("vase", 0.35),))
     with Store.create(tmp_path / "m.l3r") as store:
