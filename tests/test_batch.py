@@ -266,7 +266,7 @@ def test_a_process_that_is_killed_costs_its_own_task_alone(tmp_path: Path) -> No
             pool.submit(task)
     pool.cancel()
     assert isinstance(found[0][1], WorkerError)
-    assert found[1:] == [("", ""), (flag, flag)]
+    assert sorted(found[1:]) == [("", ""), (flag, flag)]  # both may have ended before they were asked for
 
 
 def test_ray_makes_the_same_files(folder: Path, built: tuple[Path, BatchReport]) -> None:
