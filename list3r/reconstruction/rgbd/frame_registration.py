@@ -36,10 +36,9 @@ NormalEquations = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Information, shape (6, 6), and gradient, shape (6,), of the left-hand tangent (translation, rotation)."""
 
 
-_CELL_PX, _CELL_POINTS = 16, 10
-"""Part of the image in which normals may be alike but for noise, and how many tell it."""
-_CALM, _CALM_SHARE = 0.25, 1.2
-"""Quantile of the cells that tells noise, and the mean variance of a bare wall's cells over that quantile of them."""
+_CELL_PX, _COARSE_CELL_PX, _COARSE_PX, _CELL_POINTS = 16, 8, 128, 10
+"""Part of the image in which normals are alike but for noise, that of one of less width, in which structure is in every
+larger part, and how many normals tell it."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +182,7 @@ def register(
             break
     assert found is not None
     pairs = _SurfelPairs.of(model, *found)
-    of_surfaces = _solid_information(pairs, settings)
+    of_surfaces = _solid_information(pairs, frame.camera.width, settings)
     information = of_surfaces
     if photometric:
         information = information + (
@@ -299,8 +298,8 @@ def _geometric_slope(pairs: _SurfelPairs) -> Floats:
     return plane_slopes(pairs.moved, pairs.normals, pairs.inverse_sigma)
 
 
-def _solid_information(pairs: _SurfelPairs, settings: RegistrationSettings) -> NDArray[np.float64]:
-    """Information of depth without the share that comes from noise alone.
+def _solid_information(pairs: _SurfelPairs, width: int, settings: RegistrationSettings) -> NDArray[np.float64]:
+    """Information of depth in an image of some width without the share that comes from noise alone.
 
     A point-to-plane slope is A n with A = (I, [q]x). Noise of variance s in n adds s A A' on average, by which a bare
     wall would seem to constrain the camera; it is subtracted. A model of one view has much more of it than another.
@@ -310,16 +309,13 @@ def _solid_information(pairs: _SurfelPairs, settings: RegistrationSettings) -> N
     first, second = skew(weighted.sum(axis=0).astype(np.float64)), (weighted.T @ pairs.moved).astype(np.float64)
     feigned = np.block([[float(weight.sum()) * np.eye(3), first.T], [first, np.trace(second) * np.eye(3) - second]])
     information = _normal_equations(_geometric_slope(pairs), pairs.residual, pairs.scale, settings.huber)[0]
-    information -= max(settings.normal_noise**2, _normal_variance(pairs)) * feigned
+    information -= max(settings.normal_noise**2, _normal_variance(pairs, width)) * feigned
     return information
 
 
-def _normal_variance(pairs: _SurfelPairs) -> float:
-    """Noise of the model's normals, the variance about those around them in the image along one axis, rad^2.
-
-    The calmest cells tell it: in others edges and curves add to it, and they are no noise.
-    """
-    column, row = np.floor(pairs.uv / _CELL_PX).astype(np.int64).T
+def _normal_variance(pairs: _SurfelPairs, width: int) -> float:
+    """Variance of the model's normals about those around them in the image, along one axis, rad^2: the median cell."""
+    column, row = np.floor(pairs.uv / (_CELL_PX if width > _COARSE_PX else _COARSE_CELL_PX)).astype(np.int64).T
     cell = row * (column.max() + 1) + column
     count = np.bincount(cell)
     full = count >= _CELL_POINTS
@@ -327,7 +323,7 @@ def _normal_variance(pairs: _SurfelPairs) -> float:
         return 0.0
     total = np.stack([np.bincount(cell, axis)[full] for axis in pairs.normals.T], axis=1)
     n = count[full]
-    return _CALM_SHARE * float(np.quantile((n - (total**2).sum(axis=1) / n) / (2 * (n - 1)), _CALM))
+    return float(np.median((n - (total**2).sum(axis=1) / n) / (2 * (n - 1))))
 
 
 def _photometric(
