@@ -158,6 +158,19 @@ def test_yes_or_no(room: Room, question: str, answer: str | None) -> None:
     assert room[0].find(question).answer == answer
 
 
+def test_no_such_thing_is_said_with_how_many_things_have_no_name(tmp_path: Path, room: Room) -> None:
+    said = {
+        name: {"id": name, "object_tag": label, "object_caption": "", "bbox_center": (n, 0, 1), "bbox_extent": (1, 1, 1)}
+        for n, (name, label) in enumerate({"a": "mug", "b": "", "c": "", "d": ""}.items())
+    }
+    (tmp_path / "obj_json_room.json").write_text(json.dumps(said))
+    import_map(tmp_path / "obj_json_room.json", tmp_path / "room.l3r")
+    with list3r.open(tmp_path / "room.l3r") as memory:
+        found = memory.find("is there a sink?")
+        assert found.answer == "no" and found.notes[0].endswith("; 75% of the things have no name and may be it")
+    assert "no name" not in " ".join(room[0].find("is there a sink?").notes)
+
+
 def test_an_exact_name_comes_before_another_word_and_a_kind_before_a_use(room: Room) -> None:
     memory, _ = room
     scores = [memory.find(q, 1)[0].score for q in ("couch", "sofa", "seats", "something to sit on")]
