@@ -160,8 +160,8 @@ def test_yes_or_no(room: Room, question: str, answer: str | None) -> None:
 
 def test_no_such_thing_is_said_with_how_many_things_have_no_name(tmp_path: Path, room: Room) -> None:
     said = {
-        name: {"id": name, "object_tag": label, "object_caption": "", "bbox_center": (n, 0, 1), "bbox_extent": (1, 1, 1)}
-        for n, (name, label) in enumerate({"a": "mug", "b": "", "c": "", "d": ""}.items())
+        str(n): {"id": n, "object_tag": tag, "object_caption": "", "bbox_center": (n, 0, 1), "bbox_extent": (1, 1, 1)}
+        for n, tag in enumerate(("mug", "", "", ""))
     }
     (tmp_path / "obj_json_room.json").write_text(json.dumps(said))
     import_map(tmp_path / "obj_json_room.json", tmp_path / "room.l3r")
