@@ -158,6 +158,23 @@ def test_yes_or_no(room: Room, question: str, answer: str | None) -> None:
     assert room[0].find(question).answer == answer
 
 
+@pytest.mark.parametrize(
+    ("question", "count", "answer"),
+    [
+        ("how many teacups are on the table?", 0, None),
+        ("how many armchairs are there?", None, None),
+        ("is there an armchair?", None, None),
+        ("how many bicycles are there?", 0, None),
+        ("is there a dog?", None, "no"),
+    ],
+)
+def test_what_has_a_broader_name_may_be_what_is_asked_for(
+    room: Room, question: str, count: int | None, answer: str | None
+) -> None:
+    found = room[0].find(question)
+    assert (found.counted, found.answer, found.exact) == (count, answer, False)
+
+
 def test_no_such_thing_is_said_with_how_many_things_have_no_name(tmp_path: Path, room: Room) -> None:
     said = {
         str(n): {"id": n, "object_tag": tag, "object_caption": "", "bbox_center": (n, 0, 1), "bbox_extent": (1, 1, 1)}

@@ -57,7 +57,7 @@ class Found(Matches):
         self.exact = True
         """False where nothing fits, and the matches are only the nearest by meaning or look."""
         self.counted: int | None = None
-        """How many there are, for a question that asks so."""
+        """How many there are, for a question that asks so; None too where the memory cannot know it."""
         self.answer: str | None = None
         """yes or no, for a question that asks so; None too where the memory cannot know it."""
         self.mentioned: dict[int, float] = {}
@@ -102,13 +102,21 @@ def find(
     found = _by_words_alone(store, question, k) if viewpoint is None else None
     if found is None:
         found = _labelled(store, question, k) or _asked(store, question, k, viewpoint, encoder)
+    unsure = not found.exact and _may_be(question, found)
     if question.kind == "count":
-        found.counted = found.total if found.exact else 0
+        found.counted = found.total if found.exact else None if unsure else 0
+    found.answer = None if unsure else found.answer
     if question.kind in ("where", "room") and found.exact:
         found[:] = [_placed(store, m) for m in found]
     found.mentioned |= {m.instance.id: m.score for m in found}
     found.notes = tuple(dict.fromkeys((*found.notes, *question.notes)))
     return found
+
+
+def _may_be(question: Question, found: Found) -> bool:
+    """Tell whether something found has a broader name than was asked for: what is called a cup may be a mug."""
+    broader = {k for phrase in question.phrases for m in phrase.meant for k in kinds_of(m)}
+    return any(not broader.isdisjoint(called(match.instance)) for match in found)
 
 
 def _labelled(store: Store, question: Question, k: int) -> Found | None:
