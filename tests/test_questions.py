@@ -163,6 +163,7 @@ def test_yes_or_no(room: Room, question: str, answer: str | None) -> None:
     [
         ("how many armchairs are there?", None, None),
         ("is there an armchair?", None, None),
+        ("is there an armchair on the table?", None, "no"),
         ("how many bicycles are there?", 0, None),
         ("is there a dog?", None, "no"),
     ],

@@ -102,7 +102,7 @@ def find(
     found = _by_words_alone(store, question, k) if viewpoint is None else None
     if found is None:
         found = _labelled(store, question, k) or _asked(store, question, k, viewpoint, encoder)
-    unsure = not found.exact and _may_be(question, found)
+    unsure = question.kind in ("count", "exists") and not found.exact and _may_be(store, question, viewpoint)
     if question.kind == "count":
         found.counted = found.total if found.exact else None if unsure else 0
     found.answer = None if unsure else found.answer
@@ -113,10 +113,14 @@ def find(
     return found
 
 
-def _may_be(question: Question, found: Found) -> bool:
-    """Tell whether something found has a broader name than was asked for: what is called a cup may be a mug."""
-    broader = {k for phrase in question.phrases for m in phrase.meant for k in kinds_of(m)}
-    return any(not broader.isdisjoint(called(match.instance)) for match in found)
+def _may_be(store: Store, question: Question, viewpoint: Place | None) -> bool:
+    """Tell whether all but the name fits something with a broader one: a cup on the table may be a mug."""
+    for phrase in question.phrases:
+        for kind in dict.fromkeys(k for m in phrase.meant for k in kinds_of(m)):
+            wider = replace(phrase, noun=tuple(split_words(kind)), meant=(kind,))
+            if any(kind in called(c.instance) for c in meant(store, wider, viewpoint)[0]):
+                return True
+    return False
 
 
 def _labelled(store: Store, question: Question, k: int) -> Found | None:
