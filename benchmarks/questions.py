@@ -1,13 +1,20 @@
 """Ask a memory what people would ask, and compare with the right answers.
 
     python benchmarks/questions.py                                     # the room of 67 named things
-    python benchmarks/questions.py --demo demo/rooms.l3r               # and the memory of `list3r demo`
+    python benchmarks/questions.py --memory demo=demo/rooms.l3r        # and the memory of `list3r demo`
     python benchmarks/questions.py --unseen                            # questions that nobody looked at meanwhile
     python benchmarks/questions.py --wrong                             # prints each question that went wrong
+    list3r build .../redkitchen -m kitchen.l3r --frames 0:300 --detector nanodet-m-416.param
+    PYTHONPATH=. python benchmarks/discovery_memory.py --seeds 5101-5102 --frames 150 --keep FOLDER
+    PYTHONPATH=. python benchmarks/phone.py --only portrait --detector nanodet-m-416.param --keep FOLDER
+    python benchmarks/questions.py --memory kitchen=kitchen.l3r --memory colour=FOLDER/portrait.l3r \\
+        --memory world_5101=FOLDER/world-5101-150/learned.l3r --memory world_5102=FOLDER/world-5102-150/learned.l3r
 
 A question is right where the first answer is one of those that a person would point at, where the count or yes or no
 is right, or, where there is nothing to point at, where no answer claims to be exact. It is confidently wrong where the
-first answer is wrong with a score above 0.9, or a count or a yes or no is given and wrong.
+first answer is wrong with a score above 0.9, or a count or a yes or no is given and wrong. A thing of a memory is
+known by the nearest place within `near` metres (0.25 where a table has none); places are those of the true things of
+the simulated walks and of what the kitchen's pictures show, so a thing that was not found or not named counts as wrong.
 """
 
 from __future__ import annotations
@@ -136,9 +143,11 @@ def keys_at(path: Path, name: str, near_m: float = 0.25) -> dict[int, str]:
     """Return the key of each thing whose centre is at one of a table of places: ids are others in each build."""
     rows = read_table(name)
     places = np.array([[float(r[k]) for k in "xyz"] for r in rows])
+    near = np.array([float(r.get("near") or near_m) for r in rows])
     with list3r.open(path) as memory:
         off = {i.id: np.linalg.norm(places - i.center, axis=1) for i in memory}
-    return {n: rows[int(d.argmin())]["key"] for n, d in off.items() if d.min() <= near_m}
+    found = {n: np.where(d <= near, d, np.inf) for n, d in off.items()}
+    return {n: rows[int(d.argmin())]["key"] for n, d in found.items() if np.isfinite(d.min())}
 
 
 def judged(path: Path, name: str, keys: dict[int, str]) -> list[Judged]:
@@ -165,7 +174,8 @@ def summary(rows: list[Judged]) -> dict[str, Any]:
 def main() -> None:
     """Ask, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--demo", type=Path, help="memory of `list3r demo`")
+    named = "a set of question_sets and its memory, say demo=demo/rooms.l3r"
+    parser.add_argument("--memory", action="append", default=[], metavar="SET=MEMORY", help=named)
     parser.add_argument("--unseen", action="store_true", help="ask the questions that were kept aside")
     parser.add_argument("--wrong", action="store_true", help="print what went wrong")
     parser.add_argument("--json", type=Path, help="write the results here")
@@ -173,8 +183,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path, keys = make_room(Path(folder))
         sets = {"room": judged(path, "room_unseen.tsv" if options.unseen else "room_questions.tsv", keys)}
-    if options.demo is not None:
-        sets["demo"] = judged(options.demo, "demo_questions.tsv", keys_at(options.demo, "demo.tsv"))
+    for name, file in (entry.split("=", 1) for entry in options.memory):
+        sets[name] = judged(Path(file), f"{name}_questions.tsv", keys_at(Path(file), f"{name}.tsv"))
     for name, rows in sets.items():
         print(name, summary(rows))
         for r in rows:

@@ -158,6 +158,36 @@ def test_yes_or_no(room: Room, question: str, answer: str | None) -> None:
     assert room[0].find(question).answer == answer
 
 
+@pytest.mark.parametrize(
+    ("question", "count", "answer"),
+    [
+        ("how many armchairs are there?", None, None),
+        ("is there an armchair?", None, None),
+        ("is there an armchair on the table?", None, "no"),
+        ("how many bicycles are there?", 0, None),
+        ("is there a dog?", None, "no"),
+    ],
+)
+def test_what_has_a_broader_name_may_be_what_is_asked_for(
+    room: Room, question: str, count: int | None, answer: str | None
+) -> None:
+    found = room[0].find(question)
+    assert (found.counted, found.answer, found.exact) == (count, answer, False)
+
+
+def test_no_such_thing_is_said_with_how_many_things_have_no_name(tmp_path: Path, room: Room) -> None:
+    said = {
+        str(n): {"id": n, "object_tag": tag, "object_caption": "", "bbox_center": (n, 0, 1), "bbox_extent": (1, 1, 1)}
+        for n, tag in enumerate(("mug", "", "", ""))
+    }
+    (tmp_path / "obj_json_room.json").write_text(json.dumps(said))
+    import_map(tmp_path / "obj_json_room.json", tmp_path / "room.l3r")
+    with list3r.open(tmp_path / "room.l3r") as memory:
+        found = memory.find("is there a sink?")
+        assert found.answer == "no" and found.notes[0].endswith("; 75% of the things have no name and may be it")
+    assert "no name" not in " ".join(room[0].find("is there a sink?").notes)
+
+
 def test_an_exact_name_comes_before_another_word_and_a_kind_before_a_use(room: Room) -> None:
     memory, _ = room
     scores = [memory.find(q, 1)[0].score for q in ("couch", "sofa", "seats", "something to sit on")]

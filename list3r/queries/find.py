@@ -57,7 +57,7 @@ class Found(Matches):
         self.exact = True
         """False where nothing fits, and the matches are only the nearest by meaning or look."""
         self.counted: int | None = None
-        """How many there are, for a question that asks so."""
+        """How many there are, for a question that asks so; None too where the memory cannot know it."""
         self.answer: str | None = None
         """yes or no, for a question that asks so; None too where the memory cannot know it."""
         self.mentioned: dict[int, float] = {}
@@ -102,13 +102,25 @@ def find(
     found = _by_words_alone(store, question, k) if viewpoint is None else None
     if found is None:
         found = _labelled(store, question, k) or _asked(store, question, k, viewpoint, encoder)
+    unsure = question.kind in ("count", "exists") and not found.exact and _may_be(store, question, viewpoint)
     if question.kind == "count":
-        found.counted = found.total if found.exact else 0
+        found.counted = found.total if found.exact else None if unsure else 0
+    found.answer = None if unsure else found.answer
     if question.kind in ("where", "room") and found.exact:
         found[:] = [_placed(store, m) for m in found]
     found.mentioned |= {m.instance.id: m.score for m in found}
     found.notes = tuple(dict.fromkeys((*found.notes, *question.notes)))
     return found
+
+
+def _may_be(store: Store, question: Question, viewpoint: Place | None) -> bool:
+    """Tell whether all but the name fits something with a broader one: a cup on the table may be a mug."""
+    for phrase in question.phrases:
+        for kind in dict.fromkeys(k for m in phrase.meant for k in kinds_of(m)):
+            wider = replace(phrase, noun=tuple(split_words(kind)), meant=(kind,))
+            if any(kind in called(c.instance) for c in meant(store, wider, viewpoint)[0]):
+                return True
+    return False
 
 
 def _labelled(store: Store, question: Question, k: int) -> Found | None:

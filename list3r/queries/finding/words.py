@@ -42,11 +42,14 @@ def is_colored(instance: Instance, text: str) -> bool:
 
 
 def no_such_words(words: Sequence[str], things: Iterable[Instance], most: int = 12) -> str:
-    """Say that no instance has some words, and what most things are called (the last words of names)."""
-    last_words = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in things]
+    """Say that no instance has some words, what most are called (the last words of names), and the share nameless."""
+    listed = list(things)
+    nameless = sum(not i.label and not i.structure for i in listed)
+    last_words = [split_words(i.label or i.structure or i.description.split(",")[0])[-1:] for i in listed]
     count = Counter(word for last in last_words for word in last)
     names = ", ".join(word for word, _ in sorted(count.items(), key=lambda c: (-c[1], c[0]))[:most])
     missing = f"word{'s' if len(words) > 1 else ''} {', '.join(map(repr, words))}"
     return f"no instance has the {missing} in its label or description" + (
-        f"; frequent names: {names}" if names else ""
+        (f"; frequent names: {names}" if names else "")
+        + (f"; {nameless / len(listed):.0%} of the things have no name and may be it" if nameless else "")
     )
