@@ -11,7 +11,7 @@ import pytest
 
 import list3r
 from list3r.cli.app import run
-from list3r.exporters.meshes.closed import ClosedSurface, divided, hull, slab, zero_level
+from list3r.exporters.meshes.closed import ClosedSurface, divided, hull, net, slab, zero_level
 from list3r.exporters.meshes.instance_mesh import instance_mesh
 from list3r.memory.core.errors import OptionError
 from list3r.memory.core.geometry import Sim3
@@ -208,3 +208,12 @@ def is_closed(surface: ClosedSurface) -> bool:
         return False
     key = edges[:, 0] * len(surface.vertices) + edges[:, 1]
     return bool(np.isin(edges[:, 1] * len(surface.vertices) + edges[:, 0], key).all())
+
+
+def test_cells_that_touch_at_a_corner_have_a_vertex_each_there() -> None:
+    cells = np.zeros((2, 2, 2), bool)
+    cells[0, 0, 0] = cells[1, 1, 1] = True
+    surface, corners = net(cells)
+    assert len(surface.vertices) == len(corners) == 16
+    assert (corners == (1, 1, 1)).all(axis=1).sum() == 2
+    assert np.bincount(surface.faces.ravel()).min() >= 3

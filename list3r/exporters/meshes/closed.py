@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
 Array = NDArray[np.float64]
@@ -212,7 +214,27 @@ def net(cells: NDArray[np.bool_]) -> tuple[ClosedSurface, NDArray[np.int64]]:
     used, faces = np.unique(np.concatenate([ring[:, [0, 1, 2]], ring[:, [0, 2, 3]]]), return_inverse=True)
     vertices = sums.reshape(-1, 3)[used] / weights.reshape(-1)[used, None]
     corners = np.stack(np.unravel_index(used, shape), axis=1) - 1
-    return ClosedSurface(vertices - 2, faces.reshape(-1, 3).astype(np.int64)), corners
+    of, faces = _fans(faces.reshape(-1, 3))
+    return ClosedSurface(vertices[of] - 2, faces), corners[of]
+
+
+def _fans(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Give each ring of faces round a vertex one of its own, where cells touch at a corner.
+
+    Returns which vertex each new one is, and the faces. Each edge has two faces.
+    """
+    corner = np.arange(faces.size).reshape(-1, 3)
+    ahead, to = np.roll(corner, -1, axis=1).ravel(), np.roll(faces, -1, axis=1).ravel()
+    here, at = corner.ravel(), faces.ravel()
+    rising = at < to
+    ends = np.where(rising, here, ahead), np.where(rising, ahead, here)
+    order = np.lexsort((np.maximum(at, to), np.minimum(at, to))).reshape(-1, 2)
+    one, other = np.concatenate([end[order] for end in ends]).T
+    links = coo_matrix((np.ones(len(one), np.int8), (one, other)), shape=(faces.size, faces.size))
+    count, ring = connected_components(links, directed=False)
+    of = np.empty(count, np.int64)
+    of[ring] = at
+    return of, ring.reshape(-1, 3).astype(np.int64)
 
 
 _RING = ((0, 0), (1, 0), (1, 1), (0, 1))

@@ -34,6 +34,8 @@ _UP = 0.8
 """Cosine of the steepest slope of what is taken as level."""
 _LEVEL_CORNERS = 40
 """Of a level surface, at least."""
+_LEAST_AREA = 0.01
+"""Of a face, in those of a voxel."""
 _OTHERS = 4000
 """Points of each neighbour that are looked at."""
 _AROUND_M = 0.1
@@ -180,6 +182,9 @@ def _surface(
     shift = np.clip(np.einsum("ij,ij->i", middle - vertices, normals) + keep, -1.0, 1.0)
     moved = vertices + _carried_on(vertices, normals, seen, shift)[:, None] * normals
     _level(moved, normals, seen)
+    for _ in range(2):  # no face may lose its area
+        thin = surface.faces[_areas(moved, surface.faces) < _LEAST_AREA].ravel()
+        moved[thin] = vertices[thin]
     at = {tuple(c): n for n, c in enumerate(corners.tolist())}
 
     def place(cells: NDArray[np.int64]) -> Array:
@@ -191,6 +196,11 @@ def _surface(
         return e.world(places)
 
     return ClosedSurface(e.world(moved), surface.faces), np.asarray(seen[surface.faces].all(axis=1)), place
+
+
+def _areas(vertices: Array, faces: NDArray[np.int64]) -> Array:
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
 def _carried_on(vertices: Array, normals: Array, seen: NDArray[np.bool_], shift: Array) -> Array:
