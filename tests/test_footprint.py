@@ -57,3 +57,9 @@ def test_python_and_json_give_the_same_outline(make_memory: Callable[..., Path],
         for n, ring in outlined.items():
             np.testing.assert_allclose(ring, memory.footprint(n), atol=1e-4)
             assert np.ptp(memory[n].aabb[:, :2], axis=0).max() >= 0.5
+
+
+def test_what_is_thinner_than_its_points_are_apart_has_the_outline_of_its_box() -> None:
+    points = np.random.default_rng(2).uniform((0, 0, 1), (0.8, 0.001, 1.5), (400, 3))
+    ring = footprint(InstanceSurface(points, instance(1, (0.4, 0.0, 1.2), (0.8, 0.02, 0.5), (9, 9, 9))))
+    assert len(ring) >= 3 and area_of(ring) > 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
-from list3r.memory.core.geometry import Array
+from list3r.memory.core.geometry import Array, OrientedBox
 from list3r.memory.core.records import Instance
 from list3r.memory.library.rooms.outline import area_of, encloses, outline
 from list3r.memory.library.rooms.space import Grid
@@ -22,6 +23,8 @@ _WHOLE = 0.95
 """Gaps that are wider are closed until so much of the surface is within one outline."""
 _LARGE_M = 0.5
 """What is longer is furniture."""
+_FULL = 0.7
+"""Share of its convex hull that an outline fills at least where its notches are taken as unseen: an L has less."""
 _CELLS = 4
 """Cells in the radius of closing."""
 
@@ -44,19 +47,26 @@ def large_footprints(store: Store, instances: Sequence[Instance]) -> dict[int, A
 
 def footprint(surface: InstanceSurface) -> Array:
     """Return the outline of a surface as seen from above, as `footprints_of` does."""
-    box = surface.instance.box
     shadow = surface.points[:, :2]
     longest = float(np.ptp(shadow, axis=0).max())
     if surface.support is None or len(shadow) < 9 or longest <= 0.0:
-        x, y = (box.rotation[:2, k] * box.size[k] / 2 for k in range(2))
-        corners = box.center[:2] + np.array([-x - y, x - y, x + y, -x + y])
-        return np.asarray(corners if area_of(corners) >= 0 else corners[::-1])
+        return _of_box(surface.instance.box)
     radius = max(_CLOSED_SPACINGS * surface.spacing, _CLOSED_SHARE * longest)
     while True:
         ring = _closed(shadow, radius)
         if radius >= longest or encloses(ring, shadow).mean() >= _WHOLE:
-            return ring
+            break
         radius *= 1.5
+    if len(ring) < 3:  # a picture on a wall
+        return _of_box(surface.instance.box)
+    around = ring[ConvexHull(ring).vertices]
+    return around if area_of(ring) >= _FULL * area_of(around) else ring
+
+
+def _of_box(box: OrientedBox) -> Array:
+    x, y = (box.rotation[:2, k] * box.size[k] / 2 for k in range(2))
+    corners = box.center[:2] + np.array([-x - y, x - y, x + y, -x + y])
+    return np.asarray(corners if area_of(corners) >= 0 else corners[::-1])
 
 
 def _closed(shadow: Array, radius: float) -> Array:
