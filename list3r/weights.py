@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.core.errors import OptionError
+from list3r.memory.store.derived import cache_folder
 
 Float = NDArray[np.float32]
 
@@ -76,8 +77,7 @@ def fetch_files(what: str, files: Mapping[str, PublishedFile], note: Callable[[s
 
     Raises `OptionError` where the network cannot be reached, or where what comes is not what was published.
     """
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    folder = Path(base).expanduser() / "list3r" / "weights"
+    folder = cache_folder("weights")
     missing = {n: f for n, f in files.items() if not _is(folder / n, f)}
     if missing:
         host = urlsplit(next(iter(missing.values())).url).hostname

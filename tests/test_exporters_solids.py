@@ -143,14 +143,16 @@ def test_a_model_for_mujoco_has_bodies_with_mass_on_fixed_structure(tmp_path: Pa
     with Store.create(path) as store, store.transaction():
         write_small_room(store)
         store.connection.execute("DELETE FROM keyframes")  # their depth is of another room
+    done: list[tuple[int, ...]] = []
     for density in (None, 400.0):
         with list3r.open(path) as memory:
-            files = memory.export("mjcf", tmp_path / "sim", density=density)
+            files = memory.export("mjcf", tmp_path / "sim", density=density, progress=lambda *n: done.append(n))
             boxes = {i.id: i.aabb for i in memory.instances()}
         model = mujoco.MjModel.from_xml_path(str(files[0]))
         things = {
             n: model.body(n) for n in range(1, model.nbody) if model.body(n).name.startswith(("mug", "chair", "table"))
         }
+        assert done[-4:] == [(n + 1, 4) for n in range(4)]
         assert len(things) == 4 and model.njnt == (0 if density is None else 4)
     for n, body in things.items():
         size = np.ptp(boxes[int(body.name.rpartition("_")[2])], axis=0)

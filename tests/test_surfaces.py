@@ -14,7 +14,7 @@ import pytest
 import list3r
 from list3r.memory.library.consolidation import consolidate
 from list3r.memory.store.store import Store
-from list3r.queries.views.dense import component_surfaces, fused_surfaces, instance_surface
+from list3r.queries.views.dense import component_surfaces, fused_surfaces, instance_surface, must_fuse
 from list3r.queries.views.depth_frames import REST
 from list3r.queries.views.fused import FusionSettings, Surface, fewer, fused
 from tests.session_scenes import ROOM, add_session, cameras, metric_store, place_together
@@ -101,7 +101,9 @@ def test_a_scene_that_is_fused_part_by_part_has_no_seams(store: Store) -> None:
 
 
 def test_what_is_kept_is_read_again_and_made_anew_where_it_is_damaged(store: Store, path: Path, tmp_path: Path) -> None:
+    assert must_fuse(store)
     made = fused_surfaces(store, component(store))
+    assert not must_fuse(store)
     (kept,) = (tmp_path / "cache/surfaces").iterdir()
     assert list(path.parent.glob("*.npz")) == []
     written = kept.stat().st_ino

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from list3r.cli.terminal import draws, say, write
+from list3r.cli.terminal import draws, note, say, write
 from list3r.memory.core.description.printable import shown
 from list3r.memory.core.errors import OptionError
 
@@ -118,6 +118,14 @@ def _given(f: Field[Any], value: Any) -> Any:
 
 _DRAWN_ROWS = 200
 """Rows of a table that is drawn: half a millisecond of processor time each (research/speed 0004)."""
+
+
+def say_fusing(scene: SceneMemory) -> None:
+    """Say that depth is fused first, where it is."""
+    from list3r.queries.views.dense import must_fuse
+
+    if must_fuse(scene.store):
+        note("fusing stored depth into surfaces, from seconds to a few minutes; they are kept for the next time")
 
 
 def print_table(rows: Iterable[Sequence[object]], header: Sequence[str]) -> None:

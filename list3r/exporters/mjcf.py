@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -37,6 +38,8 @@ class MjcfSettings:
     """Of the instances that become bodies; None for all."""
     guessed_metre: bool = False
     """Take a guessed metre for one; masses then are off by three times its deviation."""
+    progress: Callable[[int, int], None] | None = None
+    """Called with how many of the instances are done, and how many there are."""
 
     def __post_init__(self) -> None:
         check_density(self.density)
@@ -69,10 +72,13 @@ def write_mjcf(store: Store, folder: str | Path, settings: MjcfSettings | None =
         _add_structure(world, [i for i in there if i.structure is not None], store)
         solids, held = Solids(store), _hanging(store)
         wanted = None if s.ids is None else {store.instances.get(n).id for n in s.ids}
-        for i in there if wanted is None else [i for i in there if i.id in wanted]:
-            if i.structure is None and not i.dynamic and (solid := solids.of(i)) is not None:
+        things = [i for i in there if i.structure is None and not i.dynamic and (wanted is None or i.id in wanted)]
+        for n, i in enumerate(things, 1):
+            if (solid := solids.of(i)) is not None:
                 density = None if i.id in held else s.density
                 _add_thing(asset, world, i, solid, density, temporary / "meshes")
+            if s.progress is not None:
+                s.progress(n, len(things))
         Xml.indent(root)
         Xml.ElementTree(root).write(temporary / "scene.xml", encoding="utf-8", xml_declaration=True)
     return tuple(sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: (p.suffix != ".xml", p)))

@@ -314,31 +314,15 @@ def _of_other_names(gathered: Gathered, phrase: Phrase, ids: NDArray[np.int64]) 
 # ---------------------------------------------------------------------------------------------- phrases
 
 
-class _Known:
-    """All instances of a small memory with their words, kept until the file changes: looser names are tried on them."""
-
-    def __init__(self) -> None:
-        self._stamp: object = None
-        self._kept: list[tuple[Instance, dict[str, float]]] = []
-
-    def all_of(self, store: Store) -> list[tuple[Instance, dict[str, float]]]:
-        """Return all instances of a memory and their words."""
-        if (stamp := store.connection.stamp()) != self._stamp:
-            self._kept, self._stamp = self.with_words(store.instances.all()), stamp
-        return self._kept
-
-    def with_words(self, instances: Iterable[Instance]) -> list[tuple[Instance, dict[str, float]]]:
-        """Return instances and their words."""
-        return [(i, _vocabulary(i)) for i in instances]
-
-
 def meant(
     store: Store, phrase: Phrase, viewpoint: Place | None = None, encoder: WordEncoder | None = None
 ) -> tuple[list[PhraseMatch], PhraseSearch]:
     """Return all that a phrase means, the best first, and the search with its notes and unknown words."""
     gathered = gather(store, phrase)
-    known = store.derived.of(_Known)
-    loaded = known.all_of(store) if gathered is None else known.with_words(store.instances.of(sorted(gathered.ids)))
+    if gathered is None:  # looser names are tried on the same
+        loaded = store.current.get("words", lambda: _with_words(store.instances.all()))
+    else:
+        loaded = _with_words(store.instances.of(sorted(gathered.ids)))
     looked_at = [(i, words) for i, words in loaded if i.state != "removed" or phrase.change]
     things, words = {i.id: i for i, _ in looked_at}, {i.id: w for i, w in looked_at}
     search = PhraseSearch(store, things, words, encoder, viewpoint, gathered)
@@ -416,6 +400,10 @@ def _changed(search: PhraseSearch, found: list[PhraseMatch], kind: str) -> list[
     if not out:
         search.notes.append(f"no session shows that anything of this was {kind}")
     return [PhraseMatch(c.instance, c.score * e.score, (*c.reasons, f"{e.event.kind}: {e.reason}")) for c, e in out]
+
+
+def _with_words(instances: Iterable[Instance]) -> list[tuple[Instance, dict[str, float]]]:
+    return [(i, _vocabulary(i)) for i in instances]
 
 
 def _vocabulary(i: Instance) -> dict[str, float]:

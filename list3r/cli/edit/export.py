@@ -14,7 +14,7 @@ import typer
 
 from list3r.cli.answer import print_answer
 from list3r.cli.bar import progress_bar
-from list3r.cli.common import JsonOption, MemoryArgument, MinConfidence, open_memory
+from list3r.cli.common import JsonOption, MemoryArgument, MinConfidence, open_memory, say_fusing
 from list3r.cli.terminal import note, say
 from list3r.exporters.registry import FORMATS, find_format
 from list3r.memory.core.errors import OptionError
@@ -108,6 +108,8 @@ def export(
             _pipe(scene, to, options)
         return
     with open_memory(memory, min_confidence) as scene, _watched(to, quiet=json) as watch:
+        if to in ("glb", "web") or (mesh and not colliders):
+            say_fusing(scene)
         written = scene.export(to, out, **options, **watch)
     sizes = {str(path): path.stat().st_size for path in written}
     if json:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from list3r.cli.common import say_fusing
 from list3r.cli.terminal import note
 
 
@@ -30,6 +31,8 @@ def view(
 
     with contextlib.ExitStack() as stack:
         scenes = [stack.enter_context(open_scene(memory, writable=write)) for memory in memories]
+        for scene in scenes:
+            say_fusing(scene)
         viewers = [Viewer(scene, ViewerSettings(min(port + k, 65535))) for k, scene in enumerate(scenes)]
         address = viewers[0].address
         if len(viewers) > 1:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,8 @@ class UsdSettings:
     invisible."""
     colliders: bool = False
     """Whether meshes collide, structure as it is and instances by the convex parts of their solids; asks for meshes."""
+    progress: Callable[[int, int], None] | None = None
+    """Called with how many of the instances are done, and how many there are."""
 
     def __post_init__(self) -> None:
         if min(self.points_per_instance, self.points_per_structure) < 0:
@@ -50,8 +52,8 @@ class UsdSettings:
 
 _OUTLINE_WIDTH = 0.02
 """Of the outlines of rooms."""
-_TOGETHER = 200
-"""Instances that are added at once."""
+_TOGETHER, _SOLIDS_TOGETHER = 200, 8
+"""Instances that are added at once; solids take a second each."""
 
 
 def write_usd(store: Store, path: str | Path, settings: UsdSettings | None = None) -> tuple[Path, ...]:
@@ -103,11 +105,14 @@ def usd_stage(store: Store, settings: UsdSettings | None = None) -> Usd.Stage:
     world = _prepare(stage, store)
     paths: dict[int, Sdf.Path] = {}
     solids = Solids(store) if settings.colliders else None
+    together = _TOGETHER if solids is None else _SOLIDS_TOGETHER
     for component in components:
         scope = world if component.main else _component_scope(stage, component)
-        for start in range(0, len(component.instances), _TOGETHER):
-            several = component.instances[start : start + _TOGETHER]
+        for start in range(0, len(component.instances), together):
+            several = component.instances[start : start + together]
             paths |= _add_together(stage, scope.GetPath(), several, store, settings, solids)
+            if settings.progress is not None:
+                settings.progress(len(paths), sum(len(c.instances) for c in components))
         add_cameras(stage, scope.GetPath(), component)
         if component.id == min(c.id for c in components):
             _add_rooms(stage, scope.GetPath(), store, paths)

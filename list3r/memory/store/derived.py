@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from pathlib import Path
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -12,6 +14,12 @@ V = TypeVar("V")
 
 KEPT_TURNS = 8
 """Chunks that come until what none of them asked for is dropped: a walk leaves most of a house behind."""
+
+
+def cache_folder(kind: str) -> Path:
+    """Return where files that can be made again are kept: in `$LIST3R_CACHE`, else in the user's cache."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    return Path(os.environ.get("LIST3R_CACHE") or home / "list3r") / kind
 
 
 class Derived:

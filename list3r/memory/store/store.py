@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from list3r.memory.core.errors import List3rError, MemoryFileError
 from list3r.memory.store.connection import Connection, is_ours
-from list3r.memory.store.derived import Derived
+from list3r.memory.store.derived import CurrentCache, Derived
 from list3r.memory.store.facts import Facts
 from list3r.memory.store.file import damaged
 from list3r.memory.store.placed import PlacedTracks, PlacedTrajectory, Surfaces
@@ -44,6 +45,8 @@ class Store:
 
     derived = cached_property(lambda _: Derived())
     """What is made of the memory and kept until it is closed."""
+    current = cached_property(lambda s: CurrentCache[Hashable, Any](s.connection.stamp, 64, lambda _: 1))
+    """What is made of the memory and kept until the file changes, by name."""
     facts = cached_property(lambda s: Facts(s.connection))
     sessions = cached_property(lambda s: Sessions(s.connection))
     frames = cached_property(lambda s: Frames(s.connection))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from list3r.memory.core.records import Instance
-from list3r.memory.store.derived import LruCache
+from list3r.memory.store.derived import LruCache, cache_folder
 from list3r.memory.store.store import Store
 from list3r.queries.relations import unit_of
 from list3r.queries.views.depth_frames import REST, depth_frames
@@ -84,23 +84,22 @@ def _support(store: Store, instance: Instance) -> Surface:
 # ---------------------------------------------------------------------------------------------- triangles
 
 
-class _Kept:
-    """Surfaces by the name of what they came from, and the names of components while the memory stays as it is."""
+class _Kept(LruCache[str, dict[int, Surface]]):
+    """Surfaces by the name of what they came from."""
 
     def __init__(self) -> None:
-        self.parts: LruCache[str, dict[int, Surface]] = LruCache(
-            _KEPT_VERTICES, lambda parts: sum(len(p.vertices) for p in parts.values())
-        )
-        self._stamp: object = None
-        self._names: dict[int, str] = {}
+        super().__init__(_KEPT_VERTICES, lambda parts: sum(len(p.vertices) for p in parts.values()))
 
-    def name(self, store: Store, component: int) -> str:
-        """Return the name of what the surface of a component comes from."""
-        if self._stamp != store.connection.stamp():
-            self._stamp, self._names = store.connection.stamp(), {}
-        if component not in self._names:
-            self._names[component] = _name(store, component)
-        return self._names[component]
+
+def must_fuse(store: Store) -> bool:
+    """Tell whether `surfaces` has to fuse depth first, which takes from seconds to minutes."""
+    return can_fuse() and not all(_file(store, k).exists() for k in {c.component for c in store.chunks.all()})
+
+
+def _file(store: Store, component: int) -> Path:
+    """Return where the surface of a component is kept."""
+    name = store.current.get(("surface", component), lambda: _name(store, component))
+    return cache_folder("surfaces") / f"{name}.npz"
 
 
 def fused_surfaces(store: Store, component: int) -> dict[int, Surface]:
@@ -110,17 +109,16 @@ def fused_surfaces(store: Store, component: int) -> dict[int, Surface]:
     if not can_fuse():
         return {}
     known = store.derived.of(_Kept)
-    name = known.name(store, component)
-    found = known.parts.get(name)
+    path = _file(store, component)
+    found = known.get(path.name)
     if found is not None:
         return found
-    path = _folder() / f"{name}.npz"
     read = _read(path)
     if read is None:
         read = _checked(store, component, *fused(store, component))
         _write(path, *read)
     whole, owner = read
-    return known.parts.put(name, {n: whole.with_faces(faces) for n, faces in _faces_of(whole, owner).items()})
+    return known.put(path.name, {n: whole.with_faces(faces) for n, faces in _faces_of(whole, owner).items()})
 
 
 def _name(store: Store, component: int) -> str:
@@ -165,12 +163,6 @@ def _faces_of(whole: Surface, owner: Ints) -> dict[int, NDArray[np.int32]]:
     order = np.argsort(owner, kind="stable")
     ids, starts = np.unique(owner[order], return_index=True)
     return dict(zip(ids.tolist(), np.split(whole.faces[order], starts[1:]), strict=False))
-
-
-def _folder() -> Path:
-    """Return where surfaces are kept: in `$LIST3R_CACHE`, else in the user's cache."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    return Path(os.environ.get("LIST3R_CACHE") or home / "list3r") / "surfaces"
 
 
 def _read(path: Path) -> tuple[Surface, Ints] | None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from list3r.memory.core.errors import MissingPackageError
 from list3r.memory.store.store import Store
 from list3r.queries.relations import unit_of
 from list3r.queries.views.depth_frames import REST, DepthFrame, depth_frames
@@ -122,8 +123,13 @@ class _Fusion:
 
     def __init__(self, settings: FusionSettings, voxel: float, most_depth: float) -> None:
         self._s, self.voxel, self._most = settings, voxel, most_depth
-        self._core: Any = importlib.import_module("open3d.core")
-        self._geometry: Any = importlib.import_module("open3d.t.geometry")
+        try:
+            self._core: Any = importlib.import_module("open3d.core")
+            self._geometry: Any = importlib.import_module("open3d.t.geometry")
+        except (ImportError, OSError) as error:  # a library of the system is missing
+            said = f"open3d, which fuses surfaces, cannot be loaded ({error})"
+            hint = "on Debian: apt-get install libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6"
+            raise MissingPackageError(f"{said}; {hint}; without open3d points are shown") from error
         self._empty = self._grid(1)
 
     def blocks(self, frame: DepthFrame) -> Ints:

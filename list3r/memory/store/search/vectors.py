@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from list3r.memory.core.errors import OptionError, SpaceMismatchError
+from list3r.memory.store.derived import cache_folder
 from list3r.memory.store.store import Store
 
 _EXACT = 30_000
@@ -278,13 +279,7 @@ def _marks(store: Store, space: str, upto: int, ids: Sequence[int]) -> dict[int,
 
 def _cache_file(memory: Path, space: str) -> Path:
     name = hashlib.sha256(f"{memory.resolve()}\n{space}".encode("utf-8", "surrogateescape")).hexdigest()[:32]
-    return _cache_folder() / f"{name}.faiss"
-
-
-def _cache_folder() -> Path:
-    """Return where indices are kept: in `$LIST3R_CACHE`, else in the user's cache."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    return Path(os.environ.get("LIST3R_CACHE") or home / "list3r") / "vectors"
+    return cache_folder("vectors") / f"{name}.faiss"
 
 
 def unit(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
